@@ -1,0 +1,40 @@
+"""Bayesian inference of polarisation parameters from Jones-matrix data."""
+
+from . import phantoms
+from .degeneracy import canonicalise, orbit
+from .files import load
+from .fitting import fit
+from .gain import ComplexGain, PhaseGain
+from .model import Model
+from .noise import KnownNoise
+from .orderings import Ordering, PolariserFirst, RetarderFirst
+from .priors import AxialVonMises, Prior, TruncatedNormal, UniformAngle, VonMises
+from .records import Fit, Measurement, Parameters, Status
+from .simulation import simulate
+from .storage import save
+
+__all__ = [
+    "AxialVonMises",
+    "ComplexGain",
+    "Fit",
+    "KnownNoise",
+    "Measurement",
+    "Model",
+    "Ordering",
+    "Parameters",
+    "PhaseGain",
+    "PolariserFirst",
+    "Prior",
+    "RetarderFirst",
+    "Status",
+    "TruncatedNormal",
+    "UniformAngle",
+    "VonMises",
+    "canonicalise",
+    "fit",
+    "load",
+    "orbit",
+    "phantoms",
+    "save",
+    "simulate",
+]

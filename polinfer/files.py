@@ -1,0 +1,43 @@
+"""Which types a file of this package may be made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from . import storage
+from .gain import ComplexGain, PhaseGain
+from .model import Model
+from .noise import KnownNoise
+from .orderings import PolariserFirst, RetarderFirst
+from .phantoms import Phantom
+from .priors import AxialVonMises, TruncatedNormal, UniformAngle, VonMises
+from .records import Fit, Measurement, Parameters
+
+__all__ = ["TYPES", "load"]
+
+TYPES: tuple[type, ...] = (
+    Measurement, Fit, Phantom, Parameters, Model,
+    RetarderFirst, PolariserFirst,
+    VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
+    KnownNoise, PhaseGain, ComplexGain,
+)  # fmt: skip
+
+
+def load(path: str | Path, classes: tuple[type, ...] = ()) -> Any:
+    """The record that :func:`polinfer.save` wrote to ``path`` (``.nc`` or ``.zarr``).
+
+    ``classes`` are types of your own that the record holds, such as a prior or an ordering. Nothing is unpickled.
+
+    Raises
+    ------
+    FileNotFoundError: nothing there. ValueError: a foreign, damaged or newer file, or a type that was not offered.
+
+    >>> import tempfile, numpy as np
+    >>> from polinfer import save
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save(Measurement(np.eye(2), np.eye(2), sigma=0.1), Path(folder) / "data.nc")
+    ...     load(path).sigma.item()
+    0.1
+    """
+    return storage.load(path, (*TYPES, *classes))

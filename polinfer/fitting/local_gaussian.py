@@ -1,0 +1,115 @@
+"""The Gaussian around a maximum, and the evidence that follows from it (Laplace)."""
+
+from __future__ import annotations
+
+from functools import partial
+from math import log, pi, sqrt
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..degeneracy import orbit
+from ..model import Model
+from ..records import PERIODS, RANGES, Parameters
+from ..statistics import Statistics
+from .newton import value_gradient_hessian
+
+__all__ = ["Local", "describe", "equivalent", "log_density"]
+
+
+class Local(NamedTuple):
+    """Per pixel: covariance of the free parameters, which of them are not identified, and the log evidence."""
+
+    covariance: np.ndarray
+    unidentified: np.ndarray
+    log_evidence: np.ndarray
+
+
+def uniform_std(name: str) -> float:
+    """Standard deviation of a uniform distribution over the range of a parameter."""
+    low, high = getattr(RANGES, name)
+    return (high - low) / sqrt(12)
+
+
+def _rows(model: Model) -> np.ndarray:
+    """Which of the eight copies a model with fixed parameters can tell apart, ``(8,)`` bool."""
+    generic = dict(zip(Parameters._fields, (0.37, 0.41, 1.13, 0.29, 0.53), strict=True))
+    generic |= dict.fromkeys(model.dropped, 0.0) | model.fixed
+    copies = orbit(Parameters(**generic))
+    keep = np.ones(8, bool)
+    for name, value in model.fixed.items():
+        difference = getattr(copies, name) - value
+        period = getattr(PERIODS, name) if name != "retardance" or model.known_gain.free_phase else np.inf
+        turns = np.round(difference / period) * period if np.isfinite(period) else 0.0
+        keep &= np.abs(difference - turns) < 1e-9
+    free = np.stack([getattr(copies, name) for name in model.free]) if model.free else np.zeros((1, 8))
+    for i in range(8):
+        same = np.all(np.abs(free[:, :i] - free[:, i : i + 1]) < 1e-9, axis=0) & keep[:i]
+        keep[i] &= not same.any()
+    return keep
+
+
+def equivalent(model: Model, parameters: Parameters) -> Parameters:
+    """The copies of ``parameters`` (pixels,) that the model can tell apart, ``(copies, pixels)``."""
+    known = Parameters(*(np.where(np.isnan(x), np.zeros_like(x), x) for x in parameters))
+    rows = _rows(model)
+    return Parameters(*(x[rows] for x in orbit(known)))
+
+
+@partial(jax.jit, static_argnums=0)
+def log_density(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+    """Log posterior of parameters ``(copies, pixels)``."""
+    return model.log_density(parameters, Statistics(*(x[None] for x in statistics)))
+
+
+@partial(jax.jit, static_argnums=0)
+def _derivatives(model: Model, points: jax.Array, statistics: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Log posterior, gradient and Hessian in the free parameters at ``points`` (copies, pixels, free)."""
+
+    def one(point: jax.Array, data: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def function(x: jax.Array) -> jax.Array:
+            values = dict.fromkeys(Parameters._fields, jnp.zeros((), x.dtype))
+            values |= {name: x[i] for i, name in enumerate(model.free)}
+            return model.log_density(Parameters(**values), data)
+
+        return value_gradient_hessian(function, point)
+
+    return jax.vmap(jax.vmap(one), in_axes=(0, None))(points, statistics)
+
+
+def describe(model: Model, parameters: Parameters, statistics: Statistics) -> Local:
+    """Covariance at ``parameters`` (pixels,) and the evidence summed over the equivalent copies.
+
+    Every copy is a maximum of the likelihood but not of the prior, so its Gaussian integral is that of a parabola with
+    slope g: ``log p + g^T C g / 2 + (k log 2 pi + log |C|) / 2``.
+    """
+    copies = equivalent(model, parameters)
+    stack = np.stack([getattr(copies, name) for name in model.free], axis=-1)
+    points = np.concatenate([np.stack([getattr(parameters, name) for name in model.free], axis=-1)[None], stack])
+    value, gradient, hessian = (np.asarray(x, float) for x in _derivatives(model, points, statistics))
+    usable = np.isfinite(value) & np.isfinite(gradient).all(-1) & np.isfinite(hessian).all((-1, -2))
+    width = np.array([uniform_std(name) for name in model.free])
+    # in units of the uniform width, a curvature of 1 is what no data at all would leave
+    scaled = np.where(usable[..., None, None], -hessian * width[:, None] * width, np.eye(len(width)))
+    curvature, axes = np.linalg.eigh(scaled)
+    noise = 10 * np.finfo(points.dtype).eps * np.abs(curvature).max(axis=-1, keepdims=True)
+    flat = curvature < np.maximum(noise, 1e-9)
+    inverse = 1 / np.where(flat, 1.0, curvature)
+    covariance = np.einsum("...ij,...j,...kj->...ik", axes, inverse, axes)
+    spread = np.sqrt(np.einsum("...ii->...i", covariance))
+    largest = np.argmax(np.abs(axes), axis=-2)
+    unidentified = spread > 0.5
+    for k in range(len(width)):
+        hit = flat[..., k]
+        unidentified[hit, largest[..., k][hit]] = True
+    slope = gradient * width
+    lift = 0.5 * np.einsum("...i,...ij,...j->...", slope, covariance, slope)
+    log_volume = 0.5 * np.log(inverse).sum(-1) + np.log(width).sum() + 0.5 * len(width) * log(2 * pi)
+    integral = np.where(np.isfinite(value), value + np.where(usable, lift, 0) + log_volume, -np.inf)[1:]
+    peak = integral.max(axis=0)
+    evidence = peak + np.log(np.exp(integral - np.where(np.isfinite(peak), peak, 0)).sum(axis=0))
+    result = covariance[0] * width[:, None] * width
+    result[~usable[0]] = np.nan
+    return Local(result, unidentified[0], evidence)

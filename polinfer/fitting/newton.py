@@ -1,0 +1,155 @@
+"""Damped Newton iterations on the log posterior of many one-pixel problems at once.
+
+One problem is a pixel and a start. The Hessian is exact (automatic differentiation), its eigenvalues are made positive,
+the step is limited, and a step that lowers the density is never taken. A fixed number of problems (lanes) is advanced
+together by compiled code; finished ones make room for the next, so that a slow pixel does not hold up the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..model import Model
+from ..statistics import Statistics
+from .charts import to_parameters
+
+__all__ = ["maximise"]
+
+ROUND = 6  # iterations between two looks at which lanes have finished
+LONGEST_STEP = 0.7  # radians in chart coordinates
+KICK = 0.05  # step off a saddle
+FEW, MANY = 64, 1024  # numbers of lanes for which code is compiled
+
+
+class _State(NamedTuple):
+    point: jax.Array
+    value: jax.Array
+    gradient: jax.Array
+    hessian: jax.Array
+    damping: jax.Array
+    finished: jax.Array
+    converged: jax.Array
+
+
+def tolerance(dtype: np.dtype) -> float:
+    """Largest accepted Newton decrement, squared: twice the nats that are still to be gained."""
+    return 1e-10 if dtype == np.float64 else 2e-4
+
+
+def value_gradient_hessian(
+    function: Callable[[jax.Array], jax.Array], point: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Value, gradient and Hessian of a scalar function in one pass."""
+
+    def gradient(x: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        value, slope = jax.value_and_grad(function)(x)
+        return slope, (value, slope)
+
+    hessian, (value, slope) = jax.jacfwd(gradient, has_aux=True)(point)
+    return value, slope, hessian
+
+
+def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
+    """One iteration of one problem."""
+    dtype = state.point.dtype
+    eps, enough = jnp.finfo(dtype).eps, tolerance(np.dtype(dtype))
+    curvature, axes = jnp.linalg.eigh(-state.hessian)
+    largest = jnp.max(jnp.abs(curvature))
+    floor = 1e-3 + 10 * eps * largest
+    slope = axes.T @ state.gradient
+    size = jnp.maximum(jnp.abs(curvature), floor)
+    # along negative curvature the point is not a maximum even if the slope vanishes there
+    saddle = (curvature < -floor) & (-curvature * KICK**2 > 2 * enough)
+    decrement = jnp.sum(slope**2 / size)
+    converged = (decrement < enough) & ~jnp.any(saddle) & jnp.isfinite(state.value)
+    step = slope / (size + state.damping)
+    kick = jnp.where(slope < 0, -KICK, KICK) * floor / (floor + state.damping)
+    step = axes @ jnp.where(saddle & (jnp.abs(step) < jnp.abs(kick)), kick, step)
+    step = step * jnp.minimum(1, LONGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-30))
+    first = ~jnp.isfinite(state.value)  # the state holds no density yet: look at the point itself
+    trial = jnp.where(first, state.point, state.point + step)
+    value, gradient, hessian = value_gradient_hessian(
+        lambda x: model.log_density(to_parameters(model, x), statistics), trial
+    )
+    usable = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
+    better = usable & (first | (value >= state.value)) & ~converged
+    damping = jnp.where(better, 0.1 * state.damping, jnp.maximum(10 * state.damping, 0.1 * floor + 1e-3 * largest))
+    damping = jnp.where(damping < 1e-3 * floor, 0, damping)
+    stuck = ~first & ~better & (jnp.max(jnp.abs(step)) < 30 * eps)
+
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(better, new, old)
+
+    return _State(
+        choose(trial, state.point),
+        choose(value, state.value),
+        choose(gradient, state.gradient),
+        choose(hessian, state.hessian),
+        jnp.where(first, 0, damping),
+        state.finished | converged | stuck | (first & ~usable),
+        state.converged | converged,
+    )
+
+
+@partial(jax.jit, static_argnums=0)
+def _advance_round(model: Model, statistics: Statistics, state: _State) -> _State:
+    step = jax.vmap(partial(_advance, model))
+
+    def body(carry: tuple[jax.Array, _State]) -> tuple[jax.Array, _State]:
+        count, now = carry
+        new = step(statistics, now)
+        keep = jax.tree.map(lambda a, b: jnp.where(now.finished.reshape(-1, *(1,) * (a.ndim - 1)), b, a), new, now)
+        return count + 1, keep
+
+    def condition(carry: tuple[jax.Array, _State]) -> jax.Array:
+        return (carry[0] < ROUND) & ~jnp.all(carry[1].finished)
+
+    return jax.lax.while_loop(condition, body, (jnp.zeros((), int), state))[1]
+
+
+def _fresh(points: np.ndarray) -> _State:
+    lanes, free = points.shape
+    dtype = points.dtype
+    return _State(
+        points,
+        np.full(lanes, -np.inf, dtype),
+        np.zeros((lanes, free), dtype),
+        np.broadcast_to(-np.eye(free, dtype=dtype), (lanes, free, free)).copy(),
+        np.zeros(lanes, dtype),
+        np.zeros(lanes, bool),
+        np.zeros(lanes, bool),
+    )  # type: ignore[arg-type]
+
+
+def maximise(
+    model: Model, statistics: Statistics, pixels: np.ndarray, points: np.ndarray, iterations: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maximise the log posterior of ``pixels[i]`` (an index into the statistics) from ``points[i]``, for every i.
+
+    Returns the coordinates ``(problems, free)``, the log posterior and whether the iteration converged.
+    """
+    problems = len(points)
+    lanes = FEW if problems <= FEW else MANY
+    state = _fresh(points)
+    spent = np.zeros(problems, int)
+    waiting = np.arange(problems)
+    host = Statistics(*(np.asarray(x) for x in statistics))
+    while len(waiting):
+        active, waiting = waiting[:lanes], waiting[lanes:]
+        index = np.concatenate([active, np.full(lanes - len(active), active[0])])
+        lane = _State(*(x[index] for x in state))
+        lane.finished[len(active) :] = True
+        data = Statistics(*(x[pixels[index]] for x in host))
+        done = _advance_round(model, data, lane)
+        for old, new in zip(state, done, strict=True):
+            old[active] = np.asarray(new)[: len(active)]  # type: ignore[index]
+        spent[active] += ROUND
+        again = active[~state.finished[active] & (spent[active] < iterations)]
+        waiting = np.concatenate([waiting, again])
+    return np.asarray(state.point), np.asarray(state.value), np.asarray(state.converged)

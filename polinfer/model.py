@@ -1,0 +1,251 @@
+"""A scene, declared: its parts, and the probability they give to data and parameters."""
+
+# ruff: noqa: RUF009
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import isclose, pi
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .checks import one_of_types, real_number
+from .circular import wrap
+from .elements import multiply
+from .gain import Gain, UnitGain
+from .noise import KnownNoise
+from .orderings import Ordering, RetarderFirst
+from .priors import Prior, default_priors
+from .records import PERIODS, RANGES, Measurement, Parameters
+from .statistics import Statistics, summarise
+
+__all__ = ["Model"]
+
+
+class _Frozen(dict):
+    """A dict that does not change, and can therefore be hashed: a model is a key of compiled code."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(sorted(self.items(), key=lambda item: item[0])))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        raise TypeError("a Model does not change; make another one with the priors or fixed values you want.")
+
+
+def _known_names(name: str, given: Any) -> dict[str, Any]:
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{name} must be a dict by parameter name, got {type(given).__name__}.")
+    unknown = sorted(set(given) - set(Parameters._fields))
+    if unknown:
+        raise ValueError(
+            f"{name} has unknown parameter {unknown[0]!r}; the parameters are {', '.join(Parameters._fields)}."
+        )
+    return dict(given)
+
+
+def _dropped(fixed: Mapping[str, float]) -> frozenset[str]:
+    """Parameters that no longer appear in any product of the two elements."""
+    gone: set[str] = set()
+    if fixed.get("diattenuation") == 0:
+        gone.add("diattenuation_angle")
+    if fixed.get("retardance") == 0:
+        gone |= {"retardance_angle", "circularity"}
+    angle = fixed.get("retardance_angle")
+    if angle is not None and any(isclose(angle, axis, abs_tol=1e-12) for axis in (-pi / 2, 0.0, pi / 2)):
+        gone.add("circularity")
+    return frozenset(gone - set(fixed))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A scene: how the matrix is made up, what is known beforehand, and what else is unknown.
+
+    Parameters
+    ----------
+    ordering: the order in which light meets the elements, :class:`RetarderFirst` or :class:`PolariserFirst`.
+    priors: dict of priors by parameter name, over the defaults of :func:`polinfer.priors.default_priors`.
+    noise: :class:`KnownNoise`.
+    gain: :class:`PhaseGain`, :class:`ComplexGain`, or None: g = 1.
+    fixed: dict of known values by parameter name. A parameter that then drops out of J is integrated out: with
+        ``diattenuation`` 0 its angle; with ``retardance`` 0 its angle and the circularity; with ``retardance_angle``
+        0 or pi/2 the circularity.
+
+    Without a gain the retardance has real bounds at -pi and pi, because ``J(eta + 2 pi) = -J``; with one it is a
+    circle. A prior whose support is shorter than the period of its angle makes bounds as well.
+
+    Raises
+    ------
+    ValueError: unknown parameter names, fixed values out of range, a prior of a fixed parameter, a prior outside the
+    parameter's range. TypeError: parts of a wrong kind.
+
+    >>> from polinfer import PhaseGain
+    >>> model = Model(gain=PhaseGain(), fixed={"diattenuation": 0.0})
+    >>> model.free
+    ('retardance', 'retardance_angle', 'circularity')
+    """
+
+    ordering: Ordering = RetarderFirst()
+    priors: Any = None
+    noise: KnownNoise = KnownNoise()
+    gain: Gain | None = None
+    fixed: Any = None
+
+    def __post_init__(self) -> None:
+        one_of_types("ordering", self.ordering, (Ordering,), "pass an instance such as RetarderFirst().")
+        one_of_types("noise", self.noise, (KnownNoise,), "pass KnownNoise().")
+        if self.gain is not None:
+            one_of_types("gain", self.gain, (Gain,), "pass PhaseGain(), ComplexGain(scale) or None.")
+        fixed = _known_names("fixed", self.fixed)
+        for name, value in fixed.items():
+            low, high = getattr(RANGES, name)
+            fixed[name] = real_number(f"fixed[{name!r}]", value, low=low, high=high)
+        given = _known_names("priors", self.priors)
+        for name, prior in given.items():
+            one_of_types(f"priors[{name!r}]", prior, (Prior,), "pass a prior such as VonMises(0.0, 1.0).")
+            if name in fixed:
+                raise ValueError(
+                    f"priors and fixed both name {name!r}; a known value has no prior: remove one of the two."
+                )
+            (low, high), (left, right) = getattr(RANGES, name), prior.support
+            if left < low - 1e-9 or right > high + 1e-9:
+                raise ValueError(
+                    f"priors[{name!r}] has support ({left:g}, {right:g}), wider than the range ({low:g}, {high:g}), so "
+                    "it is not normalised there; narrow it (for the angle of an axis: AxialVonMises, UniformAngle(pi))."
+                )
+        priors = {name: prior for name, prior in (default_priors() | given).items() if name not in fixed}
+        object.__setattr__(self, "priors", _Frozen(priors))
+        object.__setattr__(self, "fixed", _Frozen(fixed))
+        try:
+            hash(self)
+        except TypeError as error:
+            raise TypeError(
+                f"priors, ordering and gain must be hashable ({error}); declare yours with @dataclass(frozen=True)."
+            ) from None
+
+    @property
+    def dropped(self) -> frozenset[str]:
+        """Names of the parameters that do not appear in J because of the fixed ones."""
+        return _dropped(self.fixed)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that are inferred."""
+        return tuple(name for name in Parameters._fields if name not in self.fixed and name not in self.dropped)
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Bounds of the free parameters that have any; the others are circles."""
+        found = {}
+        for name in self.free:
+            (low, high), (left, right) = getattr(RANGES, name), self.priors[name].support
+            whole_circle = right - left >= getattr(PERIODS, name) - 1e-9
+            if name == "retardance" and not self.known_gain.free_phase:
+                whole_circle = False
+            if not whole_circle:
+                found[name] = (max(low, left), min(high, right))
+        return found
+
+    @property
+    def known_gain(self) -> Gain:
+        """The gain as an object: ``UnitGain()`` where ``gain`` is None."""
+        return UnitGain() if self.gain is None else self.gain
+
+    def complete(self, parameters: Parameters) -> Parameters:
+        """The parameters with fixed values in place and 0 for those that drop out of J."""
+        given = parameters._asdict()
+        like = jnp.zeros((), jnp.result_type(float, *(given[name] for name in self.free)))
+        constants = dict.fromkeys(self.dropped, like) | {name: like + value for name, value in self.fixed.items()}
+        return Parameters(**(given | constants))
+
+    def jones(self, parameters: Parameters) -> jax.Array:
+        """Jones matrices ``(*P, 2, 2)``; fixed and dropped parameters are not read, and may be NaN.
+
+        >>> Model(fixed={"diattenuation": 0.0}).jones(Parameters(np.nan, np.nan, 0.0, 0.0, 0.0)).real.tolist()
+        [[1.0, 0.0], [0.0, 1.0]]
+        """
+        one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
+        return self.ordering.jones(self.complete(parameters))
+
+    def log_prior(self, parameters: Parameters) -> jax.Array:
+        """Log prior density of the free parameters, shape P (nats, angles in radians); -inf outside the ranges.
+
+        Fixed parameters have no prior, and that of a dropped one integrates to 1.
+
+        >>> round(float(Model().log_prior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0))), 4)
+        -5.5917
+        """
+        one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
+        total: Any = jnp.zeros(())
+        for name in self.free:
+            value = jnp.asarray(getattr(parameters, name))
+            if name in self.bounds:
+                low, high = self.bounds[name]
+                # the bounds are rounded like the value, or a bound in single precision lies outside
+                inside = (value >= jnp.asarray(low, value.dtype)) & (value <= jnp.asarray(high, value.dtype))
+                total = total + jnp.where(inside, self.priors[name].log_density(value), -jnp.inf)
+            else:
+                total = total + self.priors[name].log_density(wrap(value, getattr(PERIODS, name)))
+        return total
+
+    def log_likelihood(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
+        """Log density of the data, the gain integrated out (nats); shape P broadcast with that of the parameters.
+
+        ``-|g J U - V|^2 / sigma^2 - 2 n log(pi sigma^2)`` for a known g. NaN in masked pixels and where the response
+        is not finite.
+
+        Raises
+        ------
+        ValueError: the measurement has no sigma.
+
+        >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
+        >>> round(float(Model().log_likelihood(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
+        -4.5789
+        """
+        one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
+        one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
+        summary = summarise(measurement, self.noise.sigma(measurement))
+        statistics = as_device(summary.statistics, measurement.response.dtype)
+        arrays = Parameters(*(jnp.asarray(value) for value in parameters))
+        values = _log_likelihood(self, arrays, statistics)
+        return jnp.where(summary.masked | summary.non_finite, jnp.nan, values)
+
+    def log_posterior(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
+        """``log_likelihood + log_prior``: normalised as a density of data and parameters, not over the evidence.
+
+        >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
+        >>> round(float(Model().log_posterior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
+        -10.1706
+        """
+        return self.log_likelihood(parameters, measurement) + self.log_prior(parameters)
+
+    def log_density(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
+        """Log posterior density from sufficient statistics: element-wise, for JAX transformations."""
+        return self.log_data(parameters, statistics) + self.log_prior(parameters)
+
+    def log_data(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
+        """Log likelihood from sufficient statistics: element-wise, for JAX transformations."""
+        seen = multiply(self.jones(parameters), statistics.illumination)
+        return self.known_gain.log_marginal(seen, statistics.response) + statistics.constant
+
+
+@partial(jax.jit, static_argnums=0)
+def _log_likelihood(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+    return model.log_data(parameters, statistics)
+
+
+def as_device(statistics: Statistics, dtype: Any) -> Statistics:
+    """Statistics as JAX arrays in the precision of complex ``dtype`` (single where JAX has no double enabled)."""
+    complex_type = jax.dtypes.canonicalize_dtype(dtype)
+    real_type = np.zeros((), complex_type).real.dtype
+    return Statistics(
+        jnp.asarray(statistics.illumination.astype(complex_type)),
+        jnp.asarray(statistics.response.astype(complex_type)),
+        jnp.asarray(statistics.residual.astype(real_type)),
+        jnp.asarray(statistics.constant.astype(real_type)),
+    )
