@@ -1,0 +1,149 @@
+"""Find fibrelets in an image, and express camera fields in their modes.
+
+In: an image of the facet; then complex fields with variances. Out: centres, and one complex amplitude per fibrelet
+with its variance. Called by ``retrieve_fields``, which keeps fields in this basis: hundreds of numbers, not a frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+import scipy.sparse
+import scipy.sparse.linalg
+import scipy.spatial
+
+from fibre.records import Fibrelets
+from polinfer.checks import complex_array, real_array, real_number
+
+__all__ = ["find_fibrelets", "locate_fibrelets", "mode_amplitudes", "mode_matrix"]
+
+
+def find_fibrelets(image: Any) -> np.ndarray:
+    r"""Centres of the fibrelets in an image of the evenly lit facet, (m, 2) pixels (row, column), sub-pixel.
+
+    The lattice pitch p comes from the strongest ring of the image's power spectrum (first order of a hexagonal
+    lattice, :math:`2/(\sqrt 3 p)`); maxima of the slightly smoothed image at least 0.6 p apart are taken, and each is
+    refined by a quadratic fit to the logarithm of its 3 x 3 neighbourhood. Maxima below a tenth of the typical one,
+    and those at the frame's edge, are left out.
+
+    ``image``: real (y, x), non-negative up to noise, pitch at least 4 pixels. Raises ValueError when no lattice is
+    found.
+
+    >>> y, x = np.mgrid[:60, :60]
+    >>> centres = [(8 + 7 * r, 8 + 8 * c + 4 * (r % 2)) for r in range(7) for c in range(6)]
+    >>> image = sum(np.exp(-((y - r) ** 2 + (x - c) ** 2) / 5) for r, c in centres)
+    >>> found = find_fibrelets(image)
+    >>> len(found), bool(np.abs(found - np.array(centres)).max() < 0.05)
+    (42, True)
+    """
+    image = real_array("image", image, shape=(None, None), finite=True)
+    return _peaks(image)[0]
+
+
+def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
+    r"""Centres and common mode radius of the fibrelets in an intensity image, in metres from the frame's middle.
+
+    The radius follows from the curvature of the logarithm at the peaks, :math:`I \propto e^{-2 r^2/w^2}`; the median
+    over fibrelets is taken.
+    """
+    image = real_array("image", image, shape=(None, None), finite=True)
+    pixel_size = real_number("pixel_size", pixel_size, above=0)
+    centres, curvature = _peaks(image)
+    middle = (np.array(image.shape) - 1) / 2
+    return Fibrelets((centres - middle) * pixel_size, float(2 / np.sqrt(np.median(curvature)) * pixel_size))
+
+
+def _pitch(image: np.ndarray) -> float:
+    """Lattice pitch in pixels from the first ring of the power spectrum."""
+    window = np.outer(np.hanning(image.shape[0]), np.hanning(image.shape[1]))
+    power = np.abs(np.fft.fft2((image - image.mean()) * window)) ** 2
+    fy, fx = np.fft.fftfreq(image.shape[0]), np.fft.fftfreq(image.shape[1])
+    radius = np.hypot(fy[:, None], fx[None, :])
+    bins = max(image.shape)
+    ring = np.minimum((radius * bins).astype(int), bins)
+    total = np.bincount(ring.ravel(), power.ravel(), bins + 1)
+    frequency = (np.arange(bins + 1) + 0.5) / bins
+    # envelope and shading live at low frequencies, noise is flat: look between 40 and 4 pixels of pitch
+    allowed = (frequency > 2 / np.sqrt(3) / 40) & (frequency < 2 / np.sqrt(3) / 4)
+    if not np.any(total[allowed] > 0):
+        raise ValueError("image shows no lattice of fibrelets; light the whole facet evenly and focus on it.")
+    best = frequency[allowed][np.argmax(total[allowed])]
+    return float(2 / np.sqrt(3) / best)
+
+
+def _peaks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sub-pixel centres (m, 2) and curvatures (m,) of log intensity, 4 / w^2 in pixels."""
+    from skimage.feature import peak_local_max
+
+    pitch = _pitch(image)
+    smooth = scipy.ndimage.gaussian_filter(image, 0.08 * pitch)
+    peaks = peak_local_max(smooth, min_distance=max(1, int(0.4 * pitch)), exclude_border=2)
+    if len(peaks) == 0:
+        raise ValueError("image shows no fibrelets; light the whole facet evenly and focus on it.")
+    heights = smooth[tuple(peaks.T)]
+    order = np.argsort(-heights, kind="stable")
+    peaks, heights = peaks[order], heights[order]
+    bright = heights > 0.1 * np.median(heights[: max(1, len(heights) // 2)])
+    peaks = peaks[bright]
+    tree = scipy.spatial.cKDTree(peaks)
+    weaker = {j for i, j in (sorted(pair) for pair in tree.query_pairs(0.6 * pitch))}
+    peaks = np.delete(peaks, sorted(weaker), axis=0)
+    offsets = np.stack(np.mgrid[-1:2, -1:2], -1).reshape(-1, 2)
+    around = smooth[peaks[:, None, 0] + offsets[:, 0], peaks[:, None, 1] + offsets[:, 1]]
+    logs = np.log(np.maximum(around, 1e-3 * around.max(1, keepdims=True)))
+    # quadratic in (row, column): a + b r + c s + d r^2 + e s^2 + f r s, least squares on nine points
+    r, s = offsets.T
+    fit = np.linalg.pinv(np.stack([np.ones(9), r, s, r**2, s**2, r * s], 1)) @ logs.T
+    _, b, c, d, e, f = fit
+    determinant = 4 * d * e - f**2
+    peaked = (d < 0) & (e < 0) & (determinant > 0)
+    step = np.zeros((len(peaks), 2))
+    safe = np.where(peaked, determinant, 1.0)
+    step[:, 0] = np.where(peaked, (f * c - 2 * e * b) / safe, 0)
+    step[:, 1] = np.where(peaked, (f * b - 2 * d * c) / safe, 0)
+    centres = peaks + np.clip(step, -1, 1)
+    order = np.lexsort((centres[:, 1], centres[:, 0]))
+    curvature = np.where(peaked, -(d + e), np.nan)  # the smoothing is small against the mode
+    return centres[order], curvature[order][np.isfinite(curvature[order])]
+
+
+def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
+    """Modes as columns over the pixels of a frame, sparse real (y x, m), unit power per square metre each."""
+    w = fibrelets.mode_radius
+    reach = int(np.ceil(3 * w / pixel_size))
+    middle = (np.array(shape) - 1) / 2
+    pixel = fibrelets.centres / pixel_size + middle
+    offset = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], -1).reshape(-1, 2)
+    place = np.rint(pixel).astype(int)[:, None] + offset
+    inside = ((place >= 0) & (place < np.array(shape))).all(-1)
+    distance2 = ((place - pixel[:, None]) ** 2).sum(-1) * pixel_size**2
+    values = np.sqrt(2 / np.pi) / w * np.exp(-distance2 / w**2)
+    mode = np.broadcast_to(np.arange(len(pixel))[:, None], inside.shape)
+    row = np.ravel_multi_index(tuple(place[inside].T), shape)
+    return scipy.sparse.csr_array((values[inside], (row, mode[inside])), shape=(shape[0] * shape[1], len(pixel)))
+
+
+def mode_amplitudes(
+    field: Any, variance: Any, modes: scipy.sparse.csr_array, prior_power: float
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Amplitudes c of the modes G in one field by weighted least squares with a weak prior.
+
+    .. math:: \min_c \sum_x |E(x) - (G c)(x)|^2 / \mathrm{var}(x) + |c|^2 / P
+
+    ``field`` complex (y, x); ``variance`` real (y, x), infinite where the field says nothing; ``prior_power`` P, what
+    a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,) and its
+    variance (m,), the diagonal of the inverse normal matrix.
+    """
+    field = complex_array("field", field, shape=(None, None))
+    variance = real_array("variance", variance, shape=field.shape, above=0)
+    usable = np.isfinite(variance)
+    weight = np.where(usable, 1 / variance, 0).ravel()
+    known = np.where(usable, field, 0).ravel()
+    weighted = modes.T @ scipy.sparse.diags_array(weight)
+    normal = (weighted @ modes).toarray()
+    normal[np.diag_indices_from(normal)] += 1 / prior_power
+    # a few hundred to a few thousand modes: the dense inverse gives amplitudes and variances in one go
+    inverse = np.linalg.inv(normal)
+    return inverse @ (weighted @ known), np.diag(inverse).copy()

@@ -1,0 +1,71 @@
+"""Free-space propagation of sampled fields by the angular spectrum.
+
+In: a complex field on a square grid of pixels, a distance. Out: the field there. Called by phase retrieval (whose
+planes of defocus are transfer functions of the second modulator) and by anyone who holds a field.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from polinfer.checks import complex_array, real_array, real_number
+
+__all__ = ["angular_spectrum", "transfer_function"]
+
+
+def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, pixel_size: float) -> np.ndarray:
+    r"""Transfer function of free space on the frequencies of :func:`numpy.fft.fftfreq`, piston left out.
+
+    .. math:: H(f) = e^{2\pi i z (\sqrt{1/\lambda^2 - |f|^2} - 1/\lambda)}
+
+    for a wave e^{i(kz - wt)}. Evanescent frequencies get 0, and so do those whose local fringe is finer than the
+    frequency grid resolves (:math:`|z\,\partial_f \sqrt{1/\lambda^2 - f^2}| > N p / 2`: light that would have left
+    the frame and come back at the other side), the band limit of Matsushima and Shimobaba (2009).
+
+    Parameters
+    ----------
+    shape: (y, x) in pixels. distance: metres, any shape Z. wavelength, pixel_size: metres.
+
+    Returns
+    -------
+    complex128 (*Z, y, x), of modulus 1 or 0.
+
+    >>> H = transfer_function((8, 8), [0.0, 1e-5], wavelength=850e-9, pixel_size=1e-6)
+    >>> bool(np.all(H[0] == 1)), H.shape
+    (True, (2, 8, 8))
+    """
+    wavelength = real_number("wavelength", wavelength, above=0)
+    pixel_size = real_number("pixel_size", pixel_size, above=0)
+    distance = real_array("distance", distance, finite=True)[..., None, None]
+    fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
+    squared = 1 / wavelength**2 - fy[:, None] ** 2 - fx[None, :] ** 2
+    propagating = squared > 0
+    axial = np.sqrt(np.where(propagating, squared, 1.0))
+    phase = 2 * np.pi * distance * (axial - 1 / wavelength)
+    inside = propagating
+    for f, n in ((fy[:, None], shape[0]), (fx[None, :], shape[1])):
+        inside = inside & (np.abs(distance * f / axial) <= n * pixel_size / 2)
+    return np.where(inside, np.exp(1j * phase), 0.0)
+
+
+def angular_spectrum(field: Any, distance: float, wavelength: float, pixel_size: float) -> np.ndarray:
+    """The field ``distance`` metres further along the beam (negative: back), on the same grid.
+
+    ``field`` is complex (..., y, x); the frame is periodic, so leave a dark margin of the width by which the light
+    spreads. The common phase k z is left out. Source: the Rayleigh-Sommerfeld integral in the Fourier domain.
+
+    Going there and back returns a field that stays inside the frame:
+
+    >>> y, x = np.mgrid[-16:16, -16:16] * 1e-6
+    >>> beam = np.exp(-(x**2 + y**2) / (4e-6) ** 2).astype(complex)
+    >>> there = angular_spectrum(beam, 2e-5, wavelength=850e-9, pixel_size=1e-6)
+    >>> back = angular_spectrum(there, -2e-5, wavelength=850e-9, pixel_size=1e-6)
+    >>> bool(np.abs(back - beam).max() < 1e-3)
+    True
+    """
+    field = complex_array("field", field, trailing=(None, None))
+    transfer = transfer_function(field.shape[-2:], distance, wavelength, pixel_size)
+    return np.asarray(jnp.fft.ifft2(jnp.fft.fft2(field) * transfer.astype(field.dtype)))

@@ -1,0 +1,300 @@
+"""The records of this package: what each verb takes and returns.
+
+    Images -> Calibration | Recording -> (retrieve_fields) CalibrationFields | RecordingFields
+           -> (recover) Inverse -> (reconstruct) polinfer.Measurement
+
+All are frozen dataclasses of arrays in SI units; coordinates are (row, column) in metres from the middle of the frame.
+Their array fields are declared for storage, so every one can be saved and loaded.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse
+
+from fibre.propagation import transfer_function
+from polinfer.checks import complex_array, integer, one_of_types, real_array, real_number
+from polinfer.storage import array
+
+__all__ = [
+    "Calibration",
+    "CalibrationFields",
+    "Defocus",
+    "Diversity",
+    "Fibrelets",
+    "Images",
+    "Interference",
+    "Inverse",
+    "Recording",
+    "RecordingFields",
+    "RetrievalStatus",
+    "Retrieved",
+]
+
+
+class RetrievalStatus(enum.IntFlag):
+    """What to know about a retrieved field; flags add up."""
+
+    OK = 0
+    NOT_CONVERGED = 1  # still moving at the last iteration: allow more iterations, or more diverse planes
+    MISFIT = 2  # the images differ from the field's by more than their noise: check distances, masks, saturation
+
+
+@dataclass(frozen=True)
+class Diversity:
+    """Images of one field (or a batch) through known masks in the Fourier plane of the second modulator.
+
+    Image i is the intensity ``|F^-1[masks_i F[field]]|^2`` in photo-electrons per second.
+
+    Parameters
+    ----------
+    intensities: real (*B, m, y, x), >= 0 up to noise. masks: complex (m, y, x) on the frequencies of ``fftfreq``,
+    modulus at most 1. wavelength, pixel_size: metres. variance: real (*B, m, y, x) of the intensities, > 0, infinite
+    where a pixel says nothing (saturated); None = unknown, all alike.
+    """
+
+    intensities: np.ndarray = array(("*P", "image", "y", "x"), "photo-electrons/s")
+    masks: np.ndarray = array(("image", "y", "x"), "1")
+    wavelength: float
+    pixel_size: float
+    variance: np.ndarray | None = array(("*P", "image", "y", "x"), "(photo-electrons/s)^2", default=None)
+
+    def __post_init__(self) -> None:
+        intensities = real_array("intensities", self.intensities, trailing=(None, None, None), finite=True)
+        masks = complex_array("masks", self.masks, shape=intensities.shape[-3:], finite=True)
+        object.__setattr__(self, "intensities", intensities)
+        object.__setattr__(self, "masks", masks)
+        real_number("wavelength", self.wavelength, above=0)
+        real_number("pixel_size", self.pixel_size, above=0)
+        if self.variance is not None:
+            variance = real_array("variance", self.variance, above=0)
+            if variance.shape != intensities.shape:
+                raise ValueError(f"variance must have the shape of intensities {intensities.shape}, got {variance.shape}.")
+            object.__setattr__(self, "variance", variance)
+
+
+def Defocus(  # noqa: N802 - named like the record that it builds
+    intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None
+) -> Diversity:
+    """Diversity by defocus: image i (real (*B, m, y, x)) was taken ``distances[i]`` metres along the beam.
+
+    >>> Defocus(np.ones((3, 8, 8)), [-1e-5, 0, 1e-5], wavelength=850e-9, pixel_size=1e-6).masks.shape
+    (3, 8, 8)
+    """
+    intensities = real_array("intensities", intensities, trailing=(None, None, None), finite=True)
+    distances = real_array("distances", distances, shape=(intensities.shape[-3],), finite=True)
+    masks = transfer_function(intensities.shape[-2:], distances, wavelength, pixel_size)
+    return Diversity(intensities, masks, wavelength, pixel_size, variance)
+
+
+@dataclass(frozen=True)
+class Retrieved:
+    """A field from its intensities, up to a common phase.
+
+    field: complex (*B, y, x), square root of the intensity unit. variance: real (*B, y, x), E|error|^2 of the complex
+    field from the noise of the images alone. status: :class:`RetrievalStatus` (*B). iterations: (*B).
+    """
+
+    field: np.ndarray = array(("*P", "y", "x"), "sqrt(photo-electrons/s)")
+    variance: np.ndarray = array(("*P", "y", "x"), "photo-electrons/s")
+    status: np.ndarray = array(("*P",), "1")
+    iterations: np.ndarray = array(("*P",), "1")
+
+
+@dataclass(frozen=True)
+class Interference:
+    """The interference of the two polarisations, from phase-stepped images.
+
+    product: complex (*B, y, x), conj(H) V. variance: real (*B, y, x), E|error|^2 of the product; infinite where fewer
+    than three usable steps are left. mean: real (*B, y, x), (|H|^2 + |V|^2) / 2.
+    """
+
+    product: np.ndarray = array(("*P", "y", "x"), "photo-electrons/s")
+    variance: np.ndarray = array(("*P", "y", "x"), "(photo-electrons/s)^2")
+    mean: np.ndarray = array(("*P", "y", "x"), "photo-electrons/s")
+
+
+@dataclass(frozen=True)
+class Images:
+    """A stack of merged images: for each capture the defocused views of H, then the phase-stepped interference.
+
+    radiance, variance: real (capture, image, y, x), photo-electrons per second and its square; saturated: bool, the
+    same shape. Any array that is indexed by capture will do (a memory map, a lazy stack). diversity: (m,) metres,
+    defocus of the first m images. steps: (k,) radians, phase of V against H in the last k. times: (capture,)
+    seconds since the start. wavelength, pixel_size (at the facet): metres.
+    """
+
+    radiance: Any = array(("capture", "image", "y", "x"), "photo-electrons/s")
+    variance: Any = array(("capture", "image", "y", "x"), "(photo-electrons/s)^2")
+    saturated: Any = array(("capture", "image", "y", "x"), "1")
+    diversity: np.ndarray = array(("plane",), "m")
+    steps: np.ndarray = array(("step",), "rad")
+    times: np.ndarray = array(("capture",), "s")
+    wavelength: float
+    pixel_size: float
+
+    def __post_init__(self) -> None:
+        diversity = real_array("diversity", self.diversity, shape=(None,), finite=True)
+        steps = real_array("steps", self.steps, shape=(None,), finite=True)
+        times = real_array("times", self.times, shape=(None,), finite=True)
+        expected = (len(times), len(diversity) + len(steps))
+        for name in ("radiance", "variance", "saturated"):
+            shape = tuple(getattr(getattr(self, name), "shape", ()))
+            if len(shape) != 4 or shape[:2] != expected:
+                raise ValueError(
+                    f"{name} must have shape (capture, image, y, x) = ({expected[0]}, {expected[1]}, y, x) to go with "
+                    f"times, diversity and steps, got {shape}."
+                )
+            if shape != tuple(self.radiance.shape):
+                raise ValueError(f"{name} must have the shape of radiance {tuple(self.radiance.shape)}, got {shape}.")
+        for name, value in (("diversity", diversity), ("steps", steps), ("times", times)):
+            object.__setattr__(self, name, value)
+        real_number("wavelength", self.wavelength, above=0)
+        real_number("pixel_size", self.pixel_size, above=0)
+
+    @property
+    def captures(self) -> int:
+        """Number of captures."""
+        return len(self.times)
+
+    @property
+    def frame(self) -> tuple[int, int]:
+        """(y, x) of one image."""
+        return tuple(self.radiance.shape[-2:])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Known inputs to the fibre and the images that they made.
+
+    images: one capture per input, each with the fixed reference spot beside. inputs: sparse complex (2 p, captures),
+    amplitude of the spot at each distal point (rows: h of all p points, then v), columns are captures. points:
+    (p, 2) metres at the distal facet; grid: their (rows, columns), row by row. references: captures of the reference
+    spot alone. registration: (2, 3) affine map, camera = registration @ (row, column, 1) of the distal point.
+    """
+
+    images: Images = array((), "1")
+    inputs: Any = array(("input", "capture"), "1")
+    points: np.ndarray = array(("point", "row_column"), "m")
+    grid: tuple[int, int]
+    references: Images = array((), "1")
+    registration: np.ndarray = array(("row_column", "affine"), "1")
+
+    def __post_init__(self) -> None:
+        one_of_types("images", self.images, (Images,), "pass the captured Images.")
+        one_of_types("references", self.references, (Images,), "pass the captures of the reference spot alone.")
+        points = real_array("points", self.points, shape=(None, 2), finite=True)
+        rows, columns = (integer("grid", n, low=1) for n in self.grid)
+        if rows * columns != len(points):
+            raise ValueError(f"grid {self.grid} must hold all points, got {len(points)} points.")
+        expected = (2 * len(points), self.images.captures)
+        if not scipy.sparse.issparse(self.inputs) or self.inputs.shape != expected:
+            came = getattr(self.inputs, "shape", type(self.inputs).__name__)
+            raise ValueError(f"inputs must be a sparse matrix (2 p, captures) = {expected}, got {came}.")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "grid", (rows, columns))
+        object.__setattr__(self, "inputs", scipy.sparse.csr_array(self.inputs))
+        object.__setattr__(
+            self, "registration", real_array("registration", self.registration, shape=(2, 3), finite=True)
+        )
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Images of a sample in n illumination states, of the same scene without the sample, and of the reference.
+
+    images: n captures. illumination: complex (2, n), nominal states. blank: n captures without the sample, which fix
+    the illumination at every point. references: captures of the reference spot alone.
+    """
+
+    images: Images = array((), "1")
+    illumination: np.ndarray = array(("polarisation", "state"), "1")
+    blank: Images = array((), "1")
+    references: Images = array((), "1")
+
+    def __post_init__(self) -> None:
+        for name in ("images", "blank", "references"):
+            one_of_types(name, getattr(self, name), (Images,), "pass the captured Images.")
+        illumination = complex_array("illumination", self.illumination, shape=(2, None), finite=True)
+        for name in ("images", "blank"):
+            captures = getattr(self, name).captures
+            if captures != illumination.shape[1]:
+                raise ValueError(
+                    f"{name} must have one capture per illumination state ({illumination.shape[1]}), got {captures}."
+                )
+        object.__setattr__(self, "illumination", illumination)
+
+
+@dataclass(frozen=True)
+class Fibrelets:
+    """Where the fibrelets are in the camera image: the basis in which fields are kept.
+
+    centres: (m, 2) metres from the middle of the frame. mode_radius: metres, 1/e radius of the field of one mode.
+    """
+
+    centres: np.ndarray = array(("fibrelet", "row_column"), "m")
+    mode_radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "centres", real_array("centres", self.centres, shape=(None, 2), finite=True))
+        real_number("mode_radius", self.mode_radius, above=0)
+
+
+@dataclass(frozen=True)
+class CalibrationFields:
+    """Mode amplitudes of every calibration capture, relative to the reference spot.
+
+    fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape,
+    E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation:
+    by how much the closure of the illumination states found the retrieval's own variance too small (1 = not at all);
+    ``variance`` contains it. inputs, points, grid, registration: as in :class:`Calibration`.
+    """
+
+    fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
+    variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
+    reference: np.ndarray = array(("polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
+    inflation: float
+    fibrelets: Fibrelets = array((), "1")
+    inputs: Any = array(("input", "capture"), "1")
+    points: np.ndarray = array(("point", "row_column"), "m")
+    grid: tuple[int, int]
+    registration: np.ndarray = array(("row_column", "affine"), "1")
+
+
+@dataclass(frozen=True)
+class RecordingFields:
+    """Mode amplitudes of a recording: n states with the sample and n without, in the calibration's fibrelets.
+
+    fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real, E|error|^2,
+    ``inflation`` contained. illumination: complex (2, n), nominal.
+    """
+
+    fields: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
+    variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
+    blank: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
+    blank_variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
+    inflation: float
+    fibrelets: Fibrelets = array((), "1")
+    illumination: np.ndarray = array(("polarisation", "state"), "1")
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """The inverse transmission matrix A^-1, and how well the calibration knows it.
+
+    matrix: sparse complex (2 p, 2 m): field at the distal points (h of all p, then v) from mode amplitudes (h of all
+    m, then v). crosstalk_variance: sparse real (2 p, p): E|error|^2 of the amplitude that leaks to a row from unit
+    amplitude in either polarisation at each point, because the calibration fields are noisy. points, grid: as in
+    :class:`Calibration`. ridge: the regularisation used, in units of the mean diagonal of Y Y^H.
+    """
+
+    matrix: Any = array(("output", "mode"), "1/sqrt(photo-electrons/s)")
+    crosstalk_variance: Any = array(("output", "point"), "1")
+    fibrelets: Fibrelets = array((), "1")
+    points: np.ndarray = array(("point", "row_column"), "m")
+    grid: tuple[int, int]
+    ridge: float

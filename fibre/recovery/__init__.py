@@ -1,0 +1,1 @@
+"""Recovery of the inverse transmission matrix: one interface (``base``), one file per method."""

@@ -1,0 +1,1 @@
+"""Phase retrieval: one interface (``base``), one file per method."""
