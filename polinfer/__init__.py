@@ -1,6 +1,8 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import phantoms
+from . import datasets, phantoms
+from .bounds import cramer_rao_bound
+from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
 from .files import load
 from .fitting import fit
@@ -31,9 +33,13 @@ __all__ = [
     "UniformAngle",
     "VonMises",
     "canonicalise",
+    "cramer_rao_bound",
+    "datasets",
+    "decompose",
     "fit",
     "load",
     "orbit",
+    "ordering_error",
     "phantoms",
     "save",
     "simulate",

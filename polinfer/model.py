@@ -178,7 +178,7 @@ class Model:
         Fixed parameters have no prior, and that of a dropped one integrates to 1.
 
         >>> round(float(Model().log_prior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0))), 4)
-        -5.5917
+        -5.3804
         """
         one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
         total: Any = jnp.zeros(())
@@ -220,7 +220,7 @@ class Model:
 
         >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
         >>> round(float(Model().log_posterior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
-        -10.1706
+        -9.9593
         """
         return self.log_likelihood(parameters, measurement) + self.log_prior(parameters)
 

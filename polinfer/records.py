@@ -232,7 +232,7 @@ class Fit:
         return Parameters(*lows), Parameters(*highs)
 
     def to_dataset(self) -> Any:
-        """The fit as a labelled :class:`xarray.Dataset` with units: ``parameters.retardance``, ``std.retardance`` ..."""
+        """The fit as a labelled :class:`xarray.Dataset`: ``parameters.retardance``, ``std.retardance``, with units."""
         return storage.to_dataset(self)
 
     def plot(self) -> Figure:

@@ -64,10 +64,11 @@ def summarise(measurement: Measurement, sigma: np.ndarray) -> Summary:
     0.0
     """
     shape, n = measurement.shape, measurement.states
-    response = measurement.response.astype(np.complex128)
-    finite = np.isfinite(response).all(axis=-2)
+    response: np.ndarray = measurement.response.astype(np.complex128)
+    finite: np.ndarray = np.isfinite(response).all(axis=-2)
     sigma = np.broadcast_to(np.asarray(sigma, np.float64), shape)
-    root_weight = np.ones(n) if measurement.weight is None else np.sqrt(measurement.weight.astype(np.float64))
+    weight = np.ones(n) if measurement.weight is None else measurement.weight
+    root_weight: np.ndarray = np.sqrt(weight.astype(np.float64))
     used = root_weight > 0
     non_finite = np.broadcast_to((~finite & used).any(axis=-1), shape)
     response = np.where(finite[..., None, :] & used[..., None, :], response, 0) * root_weight[..., None, :]

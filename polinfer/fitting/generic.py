@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincc
 
 from ..checks import one_of_types
 from ..degeneracy import REFERENCE, nearest, reduce_ranges
@@ -17,7 +17,8 @@ from ..model import Model, as_device
 from ..records import Fit, Measurement, Parameters, Status
 from ..statistics import Statistics, Summary, summarise
 from .charts import from_parameters, to_parameters
-from .local_gaussian import describe, equivalent, log_density
+from .edges import integrate
+from .local_gaussian import Local, describe, equivalent, log_density, uniform_std
 from .newton import maximise
 from .start import starts
 
@@ -75,13 +76,40 @@ def _residual(model: Model, parameters: Parameters, statistics: Statistics) -> t
     return model.log_density(parameters, statistics), chi_square, gain.mean(seen, statistics.response)
 
 
-def _at_edge(model: Model, parameters: Parameters) -> np.ndarray:
-    edge = np.zeros(parameters.diattenuation.shape, bool)
+def _on_bounds(model: Model, parameters: Parameters, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels lie on the lower and on the upper bound of a parameter."""
+    value, (low, high) = np.asarray(getattr(parameters, name)), model.bounds[name]
+    near = (1e-9 if value.dtype == np.float64 else 1e-5) * (high - low)
+    return value <= low + near, value >= high - near
+
+
+def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics, local: Local) -> Local:
+    """Replace the Gaussian where the maximum is on a bound, and its evidence also where a bound is near."""
     for name, (low, high) in model.bounds.items():
-        value = getattr(parameters, name)
-        near = (1e-9 if value.dtype == np.float64 else 1e-5) * (high - low)
-        edge |= (value <= low + near) | (value >= high - near)
-    return edge
+        k, value = model.free.index(name), np.asarray(getattr(parameters, name))
+        with np.errstate(invalid="ignore"):
+            reach = 3 * np.nan_to_num(np.sqrt(local.covariance[:, k, k]))
+        on_low, on_high = _on_bounds(model, parameters, name)
+        # a width comparable to the range says that no bound is special
+        reach = np.where(reach < high - low, reach, 0)
+        on_bound = on_low | on_high
+        chosen = np.flatnonzero(on_bound | (value < low + reach) | (value > high - reach))
+        if len(chosen) == 0:
+            continue
+        padded = np.concatenate([chosen, np.full((1 << (len(chosen) - 1).bit_length()) - len(chosen), chosen[0])])
+        edge = integrate(
+            model,
+            name,
+            (value > 0.5 * (low + high))[padded],
+            Parameters(*(np.asarray(x)[padded] for x in parameters)),
+            Statistics(*(np.asarray(x)[padded] for x in statistics)),
+        )
+        local.log_evidence[chosen] = edge.log_evidence[: len(chosen)]
+        replace = chosen[on_bound[chosen]]
+        local.covariance[replace] = edge.moments[: len(chosen)][on_bound[chosen]]
+        spread = np.sqrt(np.einsum("...ii->...i", local.covariance[replace]))
+        local.unidentified[replace] = spread > 0.5 * np.array([uniform_std(other) for other in model.free])
+    return local
 
 
 def _flat(values: np.ndarray, shape: tuple[int, ...], trailing: int, chosen: np.ndarray) -> np.ndarray:
@@ -173,16 +201,18 @@ def _fit_chunk(model: Model, host: Statistics, dtype: np.dtype, earlier: Paramet
     earlier = None if earlier is None else Parameters(*(x[fill] for x in earlier))
     statistics = as_device(host, dtype)
     best = _search(model, host, statistics, earlier, 2 if earlier is not None else 6)
-    local = describe(model, best.parameters, statistics)
+    local = _correct_edges(model, best.parameters, statistics, describe(model, best.parameters, statistics))
     log_posterior, chi_square, gain = (np.asarray(x) for x in _residual(model, best.parameters, statistics))
     status = np.where(best.converged, 0, int(Status.NOT_CONVERGED))
-    status = status | np.where(_at_edge(model, best.parameters), int(Status.AT_EDGE), 0)
+    for name in model.bounds:
+        low, high = _on_bounds(model, best.parameters, name)
+        status = status | np.where(low | high, int(Status.AT_EDGE), 0)
     for i, name in enumerate(model.free):
         status = status | np.where(local.unidentified[:, i], int(Status.unidentified(name)), 0)
     real_type = chi_square.dtype
     covariance = np.zeros((size, 5, 5), real_type)
-    places = [Parameters._fields.index(name) for name in model.free]
-    covariance[np.ix_(np.arange(size), places, places)] = local.covariance
+    places = np.array([Parameters._fields.index(name) for name in model.free])
+    covariance[:, places[:, None], places] = local.covariance
     values: dict[str, np.ndarray] = {name: np.asarray(getattr(best.parameters, name)) for name in Parameters._fields}
     for name in model.dropped:
         values[name] = np.full(size, np.nan, real_type)
@@ -229,7 +259,7 @@ def _assemble(
     degrees = np.maximum(4 * summary.states - fitted, 0).astype(np.int32)
     chi_square = value("chi_square")
     with np.errstate(invalid="ignore"):
-        bad = (degrees > 0) & (chi2.sf(chi_square, np.maximum(degrees, 1)) < BAD_FIT_PROBABILITY)
+        bad = (degrees > 0) & (gammaincc(0.5 * np.maximum(degrees, 1), 0.5 * chi_square) < BAD_FIT_PROBABILITY)
     status = np.where(bad, status | int(Status.BAD_FIT), status).astype(np.int32)
     complex_type = np.result_type(real_type, np.complex64)
     return Fit(

@@ -16,7 +16,7 @@ from ..records import PERIODS, RANGES, Parameters
 from ..statistics import Statistics
 from .newton import value_gradient_hessian
 
-__all__ = ["Local", "describe", "equivalent", "log_density"]
+__all__ = ["Local", "derivatives", "describe", "equivalent", "log_density", "log_prior_ratio"]
 
 
 class Local(NamedTuple):
@@ -64,8 +64,15 @@ def log_density(model: Model, parameters: Parameters, statistics: Statistics) ->
     return model.log_density(parameters, Statistics(*(x[None] for x in statistics)))
 
 
+def log_prior_ratio(model: Model, parameters: Parameters) -> np.ndarray:
+    """``log sum_c p(copy c) / p(parameters)`` over the equivalent copies: what their evidence adds to that of one."""
+    priors = np.asarray(model.log_prior(equivalent(model, parameters)), float)
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.logaddexp.reduce(priors, axis=0) - np.asarray(model.log_prior(parameters), float))
+
+
 @partial(jax.jit, static_argnums=0)
-def _derivatives(model: Model, points: jax.Array, statistics: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
+def derivatives(model: Model, points: jax.Array, statistics: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Log posterior, gradient and Hessian in the free parameters at ``points`` (copies, pixels, free)."""
 
     def one(point: jax.Array, data: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -88,7 +95,7 @@ def describe(model: Model, parameters: Parameters, statistics: Statistics) -> Lo
     copies = equivalent(model, parameters)
     stack = np.stack([getattr(copies, name) for name in model.free], axis=-1)
     points = np.concatenate([np.stack([getattr(parameters, name) for name in model.free], axis=-1)[None], stack])
-    value, gradient, hessian = (np.asarray(x, float) for x in _derivatives(model, points, statistics))
+    value, gradient, hessian = (np.asarray(x, float) for x in derivatives(model, points, statistics))
     usable = np.isfinite(value) & np.isfinite(gradient).all(-1) & np.isfinite(hessian).all((-1, -2))
     width = np.array([uniform_std(name) for name in model.free])
     # in units of the uniform width, a curvature of 1 is what no data at all would leave

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +28,15 @@ FEW, MANY = 64, 1024  # numbers of lanes for which code is compiled
 
 
 class _State(NamedTuple):
-    point: jax.Array
-    value: jax.Array
-    gradient: jax.Array
-    hessian: jax.Array
-    damping: jax.Array
-    finished: jax.Array
-    converged: jax.Array
+    """Of every problem; JAX arrays inside compiled code, NumPy arrays outside."""
+
+    point: Any
+    value: Any
+    gradient: Any
+    hessian: Any
+    damping: Any
+    finished: Any
+    converged: Any
 
 
 def tolerance(dtype: np.dtype) -> float:
@@ -124,7 +126,7 @@ def _fresh(points: np.ndarray) -> _State:
         np.zeros(lanes, dtype),
         np.zeros(lanes, bool),
         np.zeros(lanes, bool),
-    )  # type: ignore[arg-type]
+    )
 
 
 def maximise(
@@ -148,7 +150,7 @@ def maximise(
         data = Statistics(*(x[pixels[index]] for x in host))
         done = _advance_round(model, data, lane)
         for old, new in zip(state, done, strict=True):
-            old[active] = np.asarray(new)[: len(active)]  # type: ignore[index]
+            old[active] = np.asarray(new)[: len(active)]
         spent[active] += ROUND
         again = active[~state.finished[active] & (spent[active] < iterations)]
         waiting = np.concatenate([waiting, again])

@@ -1,7 +1,8 @@
 """Where to start: the closed form and its twin, and a fixed quasi-random design.
 
 Data with little noise or of balanced states are settled by the closed form. The design finds the best basin where
-they are not: unbalanced states, strong priors, orderings without a closed form. It is the same for every pixel and every run.
+they are not: unbalanced states, strong priors, orderings without a closed form. It is the same for every pixel and
+every run.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from math import pi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
 
 from ..model import Model
 from ..records import Parameters
@@ -27,6 +27,8 @@ DESIGN = 192
 @cache
 def _design(model: Model) -> np.ndarray:
     """Points ``(DESIGN, free)`` in chart coordinates, spread over the ranges."""
+    from scipy.stats import qmc  # slow to import
+
     unit = qmc.Halton(len(model.free), scramble=False).random(DESIGN + 1)[1:]  # the first is a corner
     # half a period of the sine covers a bounded parameter once; a circle is covered by its period
     spans = [pi if name in model.bounds or name.endswith("_angle") else 2 * pi for name in model.free]

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
-from scipy.stats import truncnorm
 
 from ..checks import real_number
 from .base import Prior
@@ -63,6 +62,8 @@ class TruncatedNormal(Prior):
         return jnp.where(inside, -0.5 * ((x - self.mean) / self.scale) ** 2 - self._log_normaliser, -jnp.inf)
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+        from scipy.stats import truncnorm  # slow to import
+
         a, b = (self.low - self.mean) / self.scale, (self.high - self.mean) / self.scale
         return np.asarray(truncnorm.rvs(a, b, self.mean, self.scale, size=shape, random_state=rng))
 

@@ -24,8 +24,8 @@ class UniformAngle(Prior):
     ----------
     period: radians, > 0 (pi for an axis, 2 pi for a direction or a phase), else ValueError.
 
-    >>> round(float(UniformAngle(1.0).log_density(0.3)), 4)
-    0.0
+    >>> round(float(UniformAngle(2.0).log_density(0.3)), 4)
+    -0.6931
     """
 
     period: float = 2 * pi
