@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import i0e, i1e
 
-__all__ = ["bessel_ratio", "log_bessel", "log_scaled_bessel", "wrap"]
+__all__ = ["bessel_ratio", "log_scaled_bessel", "wrap"]
 
 # log(i0e) is differentiated twice in fits; the derivatives of i0e cancel at large arguments, those of its asymptotic
 # series do not. From 30 on, sixteen terms are exact to double precision.
@@ -42,15 +42,6 @@ def log_scaled_bessel(x: Any) -> jax.Array:
     far = 0.5 * jnp.log(inverse / (2 * pi)) + jnp.log1p(series)
     near = jnp.log(i0e(jnp.where(small, x, jnp.zeros_like(x))))
     return jnp.where(small, near, far)
-
-
-def log_bessel(x: Any) -> jax.Array:
-    """``log I_0(x)`` for ``x >= 0``, without overflow.
-
-    >>> float(log_bessel(0.0))
-    0.0
-    """
-    return log_scaled_bessel(x) + jnp.asarray(x)
 
 
 def bessel_ratio(x: Any) -> jax.Array:

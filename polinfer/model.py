@@ -181,7 +181,7 @@ class Model:
         -5.3804
         """
         one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
-        total: Any = jnp.zeros(())
+        total: Any = 0.0  # a Python number takes the precision of the parameters
         for name in self.free:
             value = jnp.asarray(getattr(parameters, name))
             if name in self.bounds:
@@ -191,7 +191,7 @@ class Model:
                 total = total + jnp.where(inside, self.priors[name].log_density(value), -jnp.inf)
             else:
                 total = total + self.priors[name].log_density(wrap(value, getattr(PERIODS, name)))
-        return total
+        return jnp.asarray(total)
 
     def log_likelihood(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
         """Log density of the data, the gain integrated out (nats); shape P broadcast with that of the parameters.
@@ -207,13 +207,7 @@ class Model:
         >>> round(float(Model().log_likelihood(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
         -4.5789
         """
-        one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
-        one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
-        summary = summarise(measurement, self.noise.sigma(measurement))
-        statistics = as_device(summary.statistics, measurement.response.dtype)
-        arrays = Parameters(*(jnp.asarray(value) for value in parameters))
-        values = _log_likelihood(self, arrays, statistics)
-        return jnp.where(summary.masked | summary.non_finite, jnp.nan, values)
+        return self._evaluate(_log_data, parameters, measurement)
 
     def log_posterior(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
         """``log_likelihood + log_prior``: normalised as a density of data and parameters, not over the evidence.
@@ -222,11 +216,21 @@ class Model:
         >>> round(float(Model().log_posterior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
         -9.9593
         """
-        return self.log_likelihood(parameters, measurement) + self.log_prior(parameters)
+        return self._evaluate(_log_density, parameters, measurement)
+
+    def _evaluate(self, function: Any, parameters: Parameters, measurement: Measurement) -> jax.Array:
+        one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
+        one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
+        summary = summarise(measurement, self.noise.sigma(measurement))
+        statistics = as_device(summary.statistics, measurement.response.dtype)
+        values = function(self, Parameters(*(jnp.asarray(value) for value in parameters)), statistics)
+        return jnp.where(summary.masked | summary.non_finite, jnp.nan, values)
 
     def log_density(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
         """Log posterior density from sufficient statistics: element-wise, for JAX transformations."""
-        return self.log_data(parameters, statistics) + self.log_prior(parameters)
+        prior = self.log_prior(parameters)
+        # outside the support there may be no matrix, and the density is 0 all the same
+        return jnp.where(prior == -jnp.inf, -jnp.inf, self.log_data(parameters, statistics) + prior)
 
     def log_data(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
         """Log likelihood from sufficient statistics: element-wise, for JAX transformations."""
@@ -235,8 +239,13 @@ class Model:
 
 
 @partial(jax.jit, static_argnums=0)
-def _log_likelihood(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+def _log_data(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
     return model.log_data(parameters, statistics)
+
+
+@partial(jax.jit, static_argnums=0)
+def _log_density(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+    return model.log_density(parameters, statistics)
 
 
 def as_device(statistics: Statistics, dtype: Any) -> Statistics:

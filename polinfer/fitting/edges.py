@@ -7,7 +7,7 @@ the logarithm of the distance from the bound: the density may fall off on any sc
 
 from __future__ import annotations
 
-from math import log, pi
+from math import log
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from ..model import Model
 from ..records import Parameters
 from ..statistics import Statistics
-from .local_gaussian import derivatives, log_prior_ratio
+from .local_gaussian import derivatives, invert, log_prior_ratio, uniform_std
 
 __all__ = ["Edge", "integrate"]
 
@@ -48,23 +48,22 @@ def integrate(model: Model, name: str, high: np.ndarray, parameters: Parameters,
     others = [i for i in range(len(free)) if i != k]
     slope = np.where(usable[..., None], gradient, 0)[..., others]
     curvature = np.where(usable[..., None, None], -hessian, np.eye(len(free)))[..., others, :][..., others]
-    size, axes = np.linalg.eigh(curvature)
-    usable &= size.min(axis=-1, initial=1.0) > 0
-    size = np.maximum(size, 1e-12)
-    covariance = np.einsum("...ij,...j,...kj->...ik", axes, 1 / size, axes)
+    width = np.array([uniform_std(free[i]) for i in others])
+    covariance, log_volume, flat = invert(curvature * width[:, None] * width, np.finfo(points.dtype).eps)
+    usable &= ~flat.any(axis=-1)
+    covariance, log_volume = covariance * width[:, None] * width, log_volume + np.log(width).sum()
     shift = np.einsum("...ij,...j->...i", covariance, slope)
     # far from the maximum the others leave the neighbourhood in which they are a parabola; such nodes weigh nothing
     lift = np.where(usable, 0.5 * np.einsum("...i,...i->...", slope, shift), 0)
-    log_volume = 0.5 * len(others) * log(2 * pi) - 0.5 * np.log(size).sum(-1)
     log_weight = np.where(usable, value + lift + log_volume + np.log(span * spacing)[:, None], -np.inf)
     nodes = dict.fromkeys(Parameters._fields, np.zeros(points.shape[:-1], points.dtype))
     nodes |= {n: points[..., i] for i, n in enumerate(free)}
     everything = np.logaddexp.reduce(log_weight + log_prior_ratio(model, Parameters(**nodes)), axis=0)
-    own = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=0))
+    total = np.logaddexp.reduce(log_weight, axis=0)
+    own = np.exp(log_weight - np.where(np.isfinite(total), total, 0))
     offset = np.zeros_like(points)
     offset[..., others] = shift
     offset[..., k] = points[..., k] - stack[:, k]
-    own = np.where(np.isfinite(own), own, 0)
     moments = np.einsum("np,npi,npj->pij", own, offset, offset)
     spread = np.einsum("np,npij->pij", own, covariance)
     places = np.array(others, int)

@@ -104,7 +104,8 @@ def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics,
             Parameters(*(np.asarray(x)[padded] for x in parameters)),
             Statistics(*(np.asarray(x)[padded] for x in statistics)),
         )
-        local.log_evidence[chosen] = edge.log_evidence[: len(chosen)]
+        better = edge.log_evidence[: len(chosen)]
+        local.log_evidence[chosen] = np.where(np.isfinite(better), better, local.log_evidence[chosen])
         replace = chosen[on_bound[chosen]]
         local.covariance[replace] = edge.moments[: len(chosen)][on_bound[chosen]]
         spread = np.sqrt(np.einsum("...ii->...i", local.covariance[replace]))
@@ -239,7 +240,7 @@ def _assemble(
         frame = np.full((int(np.prod(shape)), *tail), np.nan, dtype)
         if values:
             frame[good] = np.concatenate(values)
-        return frame.reshape(*shape, *tail)
+        return frame.reshape((*shape, *tail))
 
     def value(name: str, dtype: np.dtype | type = real_type) -> np.ndarray:
         return spread([part.values[name] for part in parts], dtype)
@@ -265,7 +266,7 @@ def _assemble(
     return Fit(
         model=model,
         parameters=Parameters(*(value(name) for name in Parameters._fields)),
-        std=Parameters(*np.moveaxis(std, -1, 0)),
+        std=Parameters(*(std[..., i] for i in range(5))),
         covariance=covariance,
         log_posterior=value("log_posterior"),
         log_evidence=value("log_evidence"),

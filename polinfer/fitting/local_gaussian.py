@@ -16,7 +16,7 @@ from ..records import PERIODS, RANGES, Parameters
 from ..statistics import Statistics
 from .newton import value_gradient_hessian
 
-__all__ = ["Local", "derivatives", "describe", "equivalent", "log_density", "log_prior_ratio"]
+__all__ = ["Local", "derivatives", "describe", "equivalent", "invert", "log_density", "log_prior_ratio"]
 
 
 class Local(NamedTuple):
@@ -64,6 +64,28 @@ def log_density(model: Model, parameters: Parameters, statistics: Statistics) ->
     return model.log_density(parameters, Statistics(*(x[None] for x in statistics)))
 
 
+def invert(curvature: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Covariance, log of the Gaussian's volume ``log sqrt(det(2 pi C))``, and which parameters are flat.
+
+    The matrix, in units in which 1 is "no information", is brought to unit diagonal first, which keeps the digits of
+    small entries beside large ones. Directions without positive curvature are given a width of 1, and the parameter
+    that they mostly consist of is called flat.
+    """
+    size = np.sqrt(np.maximum(np.abs(np.einsum("...ii->...i", curvature)), 1e-9))
+    values, axes = np.linalg.eigh(curvature / (size[..., :, None] * size[..., None, :]))
+    directions = axes / size[..., :, None]
+    lost = values < 30 * eps
+    longest = np.max(directions**2, axis=-2)
+    values = np.where(lost, longest, values)
+    covariance = np.einsum("...ij,...j,...kj->...ik", directions, 1 / values, directions)
+    flat = np.zeros(size.shape, bool)
+    leading = np.argmax(np.abs(directions), axis=-2)
+    for k in range(size.shape[-1]):
+        flat |= lost[..., k, None] & (leading[..., k, None] == np.arange(size.shape[-1]))
+    log_volume = 0.5 * size.shape[-1] * log(2 * pi) - 0.5 * np.log(values).sum(-1) - np.log(size).sum(-1)
+    return covariance, log_volume, flat
+
+
 def log_prior_ratio(model: Model, parameters: Parameters) -> np.ndarray:
     """``log sum_c p(copy c) / p(parameters)`` over the equivalent copies: what their evidence adds to that of one."""
     priors = np.asarray(model.log_prior(equivalent(model, parameters)), float)
@@ -100,23 +122,13 @@ def describe(model: Model, parameters: Parameters, statistics: Statistics) -> Lo
     width = np.array([uniform_std(name) for name in model.free])
     # in units of the uniform width, a curvature of 1 is what no data at all would leave
     scaled = np.where(usable[..., None, None], -hessian * width[:, None] * width, np.eye(len(width)))
-    curvature, axes = np.linalg.eigh(scaled)
-    noise = 10 * np.finfo(points.dtype).eps * np.abs(curvature).max(axis=-1, keepdims=True)
-    flat = curvature < np.maximum(noise, 1e-9)
-    inverse = 1 / np.where(flat, 1.0, curvature)
-    covariance = np.einsum("...ij,...j,...kj->...ik", axes, inverse, axes)
-    spread = np.sqrt(np.einsum("...ii->...i", covariance))
-    largest = np.argmax(np.abs(axes), axis=-2)
-    unidentified = spread > 0.5
-    for k in range(len(width)):
-        hit = flat[..., k]
-        unidentified[hit, largest[..., k][hit]] = True
+    covariance, log_volume, flat = invert(scaled, np.finfo(points.dtype).eps)
+    unidentified = (np.sqrt(np.einsum("...ii->...i", covariance)) > 0.5) | flat
     slope = gradient * width
     lift = 0.5 * np.einsum("...i,...ij,...j->...", slope, covariance, slope)
-    log_volume = 0.5 * np.log(inverse).sum(-1) + np.log(width).sum() + 0.5 * len(width) * log(2 * pi)
+    log_volume = log_volume + np.log(width).sum()
     integral = np.where(np.isfinite(value), value + np.where(usable, lift, 0) + log_volume, -np.inf)[1:]
-    peak = integral.max(axis=0)
-    evidence = peak + np.log(np.exp(integral - np.where(np.isfinite(peak), peak, 0)).sum(axis=0))
+    evidence = np.logaddexp.reduce(integral, axis=0)
     result = covariance[0] * width[:, None] * width
     result[~usable[0]] = np.nan
     return Local(result, unidentified[0], evidence)

@@ -61,18 +61,20 @@ def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
     """One iteration of one problem."""
     dtype = state.point.dtype
     eps, enough = jnp.finfo(dtype).eps, tolerance(np.dtype(dtype))
-    curvature, axes = jnp.linalg.eigh(-state.hessian)
-    largest = jnp.max(jnp.abs(curvature))
-    floor = 1e-3 + 10 * eps * largest
-    slope = axes.T @ state.gradient
+    # Unit diagonal: what the prior says of a parameter that the data do not see is not lost beside a curvature of 1e16.
+    scale = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(state.hessian)), 1e-3))
+    curvature, axes = jnp.linalg.eigh(-state.hessian / (scale[:, None] * scale))
+    floor = 30 * eps
+    slope = axes.T @ (state.gradient / scale)
     size = jnp.maximum(jnp.abs(curvature), floor)
     # along negative curvature the point is not a maximum even if the slope vanishes there
-    saddle = (curvature < -floor) & (-curvature * KICK**2 > 2 * enough)
+    kick = KICK / jnp.max(jnp.abs(axes / scale[:, None]), axis=0)
+    saddle = (curvature < -floor) & (-curvature * kick**2 > 2 * enough)
     decrement = jnp.sum(slope**2 / size)
     converged = (decrement < enough) & ~jnp.any(saddle) & jnp.isfinite(state.value)
     step = slope / (size + state.damping)
-    kick = jnp.where(slope < 0, -KICK, KICK) * floor / (floor + state.damping)
-    step = axes @ jnp.where(saddle & (jnp.abs(step) < jnp.abs(kick)), kick, step)
+    kick = jnp.where(slope < 0, -kick, kick) / (1 + state.damping)
+    step = (axes @ jnp.where(saddle & (jnp.abs(step) < jnp.abs(kick)), kick, step)) / scale
     step = step * jnp.minimum(1, LONGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-30))
     first = ~jnp.isfinite(state.value)  # the state holds no density yet: look at the point itself
     trial = jnp.where(first, state.point, state.point + step)
@@ -80,9 +82,11 @@ def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
         lambda x: model.log_density(to_parameters(model, x), statistics), trial
     )
     usable = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
-    better = usable & (first | (value >= state.value)) & ~converged
-    damping = jnp.where(better, 0.1 * state.damping, jnp.maximum(10 * state.damping, 0.1 * floor + 1e-3 * largest))
-    damping = jnp.where(damping < 1e-3 * floor, 0, damping)
+    # a residual near its minimum is rounded like eps times the signal-to-noise ratio
+    rounding = 20 * eps * (1 + jnp.max(scale))
+    better = usable & (first | (value >= state.value - rounding)) & ~converged
+    damping = jnp.where(better, 0.1 * state.damping, jnp.maximum(10 * state.damping, 1e-2))
+    damping = jnp.where(damping < 1e-3, 0, damping)
     stuck = ~first & ~better & (jnp.max(jnp.abs(step)) < 30 * eps)
 
     def choose(new: jax.Array, old: jax.Array) -> jax.Array:

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import i0e
 
 from ..checks import real_number
-from ..circular import log_scaled_bessel
 from .base import Prior
 
 __all__ = ["AxialVonMises"]
@@ -41,7 +41,7 @@ class AxialVonMises(Prior):
 
     def log_density(self, x: Any) -> jax.Array:
         shifted = -2 * jnp.sin(jnp.asarray(x) - self.mean) ** 2
-        return self.concentration * shifted - log(pi) - log_scaled_bessel(self.concentration)
+        return self.concentration * shifted - log(pi) - log(i0e(self.concentration))
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         angle = 0.5 * np.asarray(rng.vonmises(0.0, self.concentration, shape)) + self.mean

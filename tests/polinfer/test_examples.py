@@ -1,0 +1,37 @@
+"""The examples of this package run as they stand."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import polinfer
+
+from .test_datasets import fibre_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def run(name, folder):
+    settings = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    command = [sys.executable, "-W", "error", str(ROOT / "examples" / name), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, env=settings, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_one_pixel(tmp_path):
+    assert "Status.OK: 0" in run("01_one_pixel.py", tmp_path)
+    assert isinstance(polinfer.load(tmp_path / "one_pixel.nc"), polinfer.Fit)
+
+
+@pytest.mark.slow
+def test_measured_fibre(tmp_path):
+    fibre_folder()
+    assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)
+    assert (tmp_path / "measured_fibre.png").stat().st_size > 10_000
