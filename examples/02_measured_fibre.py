@@ -41,7 +41,7 @@ for name, group in groups.items():
     share = np.sum(per_pair[group] ** 2) / np.sum(per_pair**2)
     print(f"  {name}: {group.mean():.1%} of the pairs, signal {size(fibre.jones[group]):.3g}, "
           f"difference {size(per_pair[group]):.3g}, {share:.0%} of the difference's energy")  # fmt: skip
-print("The difference follows the signal, so most of it is the fibre's change and not the camera's noise.")
+print("The difference follows the signal: it is hardly the camera's noise alone.")
 
 model = polinfer.Model(gain=polinfer.ComplexGain(size(fibre.jones)))
 unidentified = sum(int(Status.unidentified(name)) for name in polinfer.Parameters._fields)

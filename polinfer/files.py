@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from . import storage
+from .datasets import FibreMatrix
 from .gain import ComplexGain, PhaseGain
 from .model import Model
 from .noise import KnownNoise
@@ -17,7 +18,7 @@ from .records import Fit, Measurement, Parameters
 __all__ = ["TYPES", "load"]
 
 TYPES: tuple[type, ...] = (
-    Measurement, Fit, Phantom, Parameters, Model,
+    Measurement, Fit, Phantom, FibreMatrix, Parameters, Model,
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
     KnownNoise, PhaseGain, ComplexGain,

@@ -15,7 +15,7 @@ import numpy as np
 from ..model import Model
 from ..records import Parameters
 from ..statistics import Statistics
-from .local_gaussian import derivatives, invert, log_prior_ratio, uniform_std
+from .local_gaussian import RANGE_CURVATURE, derivatives, invert, log_density, log_prior_ratio, uniform_std
 
 __all__ = ["Edge", "integrate"]
 
@@ -49,12 +49,17 @@ def integrate(model: Model, name: str, high: np.ndarray, parameters: Parameters,
     slope = np.where(usable[..., None], gradient, 0)[..., others]
     curvature = np.where(usable[..., None, None], -hessian, np.eye(len(free)))[..., others, :][..., others]
     width = np.array([uniform_std(free[i]) for i in others])
-    covariance, log_volume, flat = invert(curvature * width[:, None] * width, np.finfo(points.dtype).eps)
+    covariance, log_volume, flat = invert(
+        curvature * width[:, None] * width, float(np.finfo(points.dtype).eps), RANGE_CURVATURE
+    )
     usable &= ~flat.any(axis=-1)
     covariance, log_volume = covariance * width[:, None] * width, log_volume + np.log(width).sum()
     shift = np.einsum("...ij,...j->...i", covariance, slope)
-    # far from the maximum the others leave the neighbourhood in which they are a parabola; such nodes weigh nothing
-    lift = np.where(usable, 0.5 * np.einsum("...i,...i->...", slope, shift), 0)
+    lift = 0.5 * np.einsum("...i,...i->...", slope, shift)
+    # The parabola of the others holds near the maximum only: a node from where it would rise above the maximum itself,
+    # or would move another parameter far, is one that it does not describe.
+    top = np.asarray(log_density(model, Parameters(*(np.asarray(x)[None] for x in parameters)), statistics), float)
+    usable &= (value + lift <= top + 0.1) & (np.abs(shift) < 0.5 * width).all(axis=-1)
     log_weight = np.where(usable, value + lift + log_volume + np.log(span * spacing)[:, None], -np.inf)
     nodes = dict.fromkeys(Parameters._fields, np.zeros(points.shape[:-1], points.dtype))
     nodes |= {n: points[..., i] for i, n in enumerate(free)}

@@ -64,19 +64,23 @@ def log_density(model: Model, parameters: Parameters, statistics: Statistics) ->
     return model.log_density(parameters, Statistics(*(x[None] for x in statistics)))
 
 
-def invert(curvature: np.ndarray, eps: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+# A direction cannot hold more volume than its range: sqrt(2 pi / curvature) <= sqrt(12) uniform standard deviations.
+RANGE_CURVATURE = 2 * pi / 12
+
+
+def invert(curvature: np.ndarray, eps: float, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Covariance, log of the Gaussian's volume ``log sqrt(det(2 pi C))``, and which parameters are flat.
 
     The matrix, in units in which 1 is "no information", is brought to unit diagonal first, which keeps the digits of
     small entries beside large ones. Directions without positive curvature are given a width of 1, and the parameter
-    that they mostly consist of is called flat.
+    that they mostly consist of is called flat. No direction is given less curvature than ``least``.
     """
     size = np.sqrt(np.maximum(np.abs(np.einsum("...ii->...i", curvature)), 1e-9))
     values, axes = np.linalg.eigh(curvature / (size[..., :, None] * size[..., None, :]))
     directions = axes / size[..., :, None]
     lost = values < 30 * eps
     longest = np.max(directions**2, axis=-2)
-    values = np.where(lost, longest, values)
+    values = np.maximum(np.where(lost, longest, values), least * longest)
     covariance = np.einsum("...ij,...j,...kj->...ik", directions, 1 / values, directions)
     flat = np.zeros(size.shape, bool)
     leading = np.argmax(np.abs(directions), axis=-2)
@@ -122,10 +126,12 @@ def describe(model: Model, parameters: Parameters, statistics: Statistics) -> Lo
     width = np.array([uniform_std(name) for name in model.free])
     # in units of the uniform width, a curvature of 1 is what no data at all would leave
     scaled = np.where(usable[..., None, None], -hessian * width[:, None] * width, np.eye(len(width)))
-    covariance, log_volume, flat = invert(scaled, np.finfo(points.dtype).eps)
+    eps = float(np.finfo(points.dtype).eps)
+    covariance, _, flat = invert(scaled, eps, 0.0)
+    within_range, log_volume, _ = invert(scaled, eps, RANGE_CURVATURE)
     unidentified = (np.sqrt(np.einsum("...ii->...i", covariance)) > 0.5) | flat
     slope = gradient * width
-    lift = 0.5 * np.einsum("...i,...ij,...j->...", slope, covariance, slope)
+    lift = 0.5 * np.einsum("...i,...ij,...j->...", slope, within_range, slope)
     log_volume = log_volume + np.log(width).sum()
     integral = np.where(np.isfinite(value), value + np.where(usable, lift, 0) + log_volume, -np.inf)[1:]
     evidence = np.logaddexp.reduce(integral, axis=0)
