@@ -18,3 +18,9 @@ from fibre.records import (
 )
 from fibre.retrieval.base import retrieve
 from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
+from fibre.fibrelets import find_fibrelets
+from fibre.fields import retrieve_fields
+from fibre.interference import relative_phase
+from fibre.reconstruction import reconstruct
+from fibre.recovery.base import recover
+from fibre.recovery.ridge import Ridge

@@ -74,7 +74,7 @@ class Bundle:
         mode_spread: float = 0.02,
         detuning: float = 8.0,
         birefringence: float = 2.0,
-        coupling: float = 0.6,
+        coupling: float = 0.25,
         wavelength: float = 850e-9,
         rng: int | np.random.Generator | None = None,
     ) -> Bundle:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import scipy.ndimage
+import scipy.optimize
 import scipy.sparse
 import scipy.sparse.linalg
 import scipy.spatial
@@ -39,20 +40,34 @@ def find_fibrelets(image: Any) -> np.ndarray:
     (42, True)
     """
     image = real_array("image", image, shape=(None, None), finite=True)
-    return _peaks(image)[0]
+    return _peaks(image)
 
 
 def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
     r"""Centres and common mode radius of the fibrelets in an intensity image, in metres from the frame's middle.
 
-    The radius follows from the curvature of the logarithm at the peaks, :math:`I \propto e^{-2 r^2/w^2}`; the median
-    over fibrelets is taken.
+    The radius w is the one whose sum of spots :math:`\sum_k p_k e^{-2 |r - r_k|^2 / w^2}`, with heights p by least
+    squares, leaves the least of the image over. ``image`` should be an incoherent sum of many fields, so that
+    neighbours do not interfere in it.
     """
     image = real_array("image", image, shape=(None, None), finite=True)
     pixel_size = real_number("pixel_size", pixel_size, above=0)
-    centres, curvature = _peaks(image)
+    centres = _peaks(image)
     middle = (np.array(image.shape) - 1) / 2
-    return Fibrelets((centres - middle) * pixel_size, float(2 / np.sqrt(np.median(curvature)) * pixel_size))
+    positions = (centres - middle) * pixel_size
+    pitch = _pitch(image) * pixel_size
+
+    def left_over(radius: float) -> float:
+        # the square of a mode of radius w is a spot of intensity with w / sqrt 2 in the same formula
+        spots = mode_matrix(Fibrelets(positions, radius / np.sqrt(2)), image.shape, pixel_size)
+        normal = (spots.T @ spots).tocsc()
+        heights = scipy.sparse.linalg.spsolve(normal, spots.T @ image.ravel())
+        return float(((image.ravel() - spots @ heights) ** 2).sum())
+
+    best = scipy.optimize.minimize_scalar(
+        left_over, bounds=(0.15 * pitch, 0.6 * pitch), method="bounded", options={"xatol": 1e-4 * pitch}
+    )
+    return Fibrelets(positions, float(best.x))
 
 
 def _pitch(image: np.ndarray) -> float:
@@ -73,8 +88,8 @@ def _pitch(image: np.ndarray) -> float:
     return float(2 / np.sqrt(3) / best)
 
 
-def _peaks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sub-pixel centres (m, 2) and curvatures (m,) of log intensity, 4 / w^2 in pixels."""
+def _peaks(image: np.ndarray) -> np.ndarray:
+    """Sub-pixel centres (m, 2), row by row."""
     from skimage.feature import peak_local_max
 
     pitch = _pitch(image)
@@ -104,13 +119,11 @@ def _peaks(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     step[:, 0] = np.where(peaked, (f * c - 2 * e * b) / safe, 0)
     step[:, 1] = np.where(peaked, (f * b - 2 * d * c) / safe, 0)
     centres = peaks + np.clip(step, -1, 1)
-    order = np.lexsort((centres[:, 1], centres[:, 0]))
-    curvature = np.where(peaked, -(d + e), np.nan)  # the smoothing is small against the mode
-    return centres[order], curvature[order][np.isfinite(curvature[order])]
+    return centres[np.lexsort((centres[:, 1], centres[:, 0]))]
 
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
-    """Modes as columns over the pixels of a frame, sparse real (y x, m), unit power per square metre each."""
+    """Modes as columns over the pixels of a frame, sparse real (y x, m), each with a sum of squares of 1."""
     w = fibrelets.mode_radius
     reach = int(np.ceil(3 * w / pixel_size))
     middle = (np.array(shape) - 1) / 2
@@ -119,7 +132,7 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     place = np.rint(pixel).astype(int)[:, None] + offset
     inside = ((place >= 0) & (place < np.array(shape))).all(-1)
     distance2 = ((place - pixel[:, None]) ** 2).sum(-1) * pixel_size**2
-    values = np.sqrt(2 / np.pi) / w * np.exp(-distance2 / w**2)
+    values = np.sqrt(2 / np.pi) * pixel_size / w * np.exp(-distance2 / w**2)
     mode = np.broadcast_to(np.arange(len(pixel))[:, None], inside.shape)
     row = np.ravel_multi_index(tuple(place[inside].T), shape)
     return scipy.sparse.csr_array((values[inside], (row, mode[inside])), shape=(shape[0] * shape[1], len(pixel)))
@@ -133,8 +146,9 @@ def mode_amplitudes(
     .. math:: \min_c \sum_x |E(x) - (G c)(x)|^2 / \mathrm{var}(x) + |c|^2 / P
 
     ``field`` complex (y, x); ``variance`` real (y, x), infinite where the field says nothing; ``prior_power`` P, what
-    a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,) and its
-    variance (m,), the diagonal of the inverse normal matrix.
+    a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,) and the
+    variance (m,): one over the diagonal of the normal matrix, which neighbours that overlap by a few per cent leave
+    right to the square of that.
     """
     field = complex_array("field", field, shape=(None, None))
     variance = real_array("variance", variance, shape=field.shape, above=0)
@@ -142,8 +156,6 @@ def mode_amplitudes(
     weight = np.where(usable, 1 / variance, 0).ravel()
     known = np.where(usable, field, 0).ravel()
     weighted = modes.T @ scipy.sparse.diags_array(weight)
-    normal = (weighted @ modes).toarray()
-    normal[np.diag_indices_from(normal)] += 1 / prior_power
-    # a few hundred to a few thousand modes: the dense inverse gives amplitudes and variances in one go
-    inverse = np.linalg.inv(normal)
-    return inverse @ (weighted @ known), np.diag(inverse).copy()
+    normal = (weighted @ modes + scipy.sparse.diags_array(np.full(modes.shape[1], 1 / prior_power))).tocsc()
+    amplitudes = scipy.sparse.linalg.splu(normal).solve(np.stack([(weighted @ known).real, (weighted @ known).imag], 1))
+    return amplitudes[:, 0] + 1j * amplitudes[:, 1], 1 / normal.diagonal()

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-import scipy.linalg
 from tqdm import tqdm
 
+from fibre.closure import NoiseScale, closure_errors, noise_scale
 from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
@@ -28,19 +28,20 @@ from fibre.records import (
 from fibre.retrieval.base import RetrievalMethod, retrieve
 from polinfer.checks import one_of_types
 
-__all__ = ["closure", "retrieve_fields"]
+__all__ = ["retrieve_fields"]
 
 
 @dataclass(frozen=True)
 class _Amplitudes:
-    values: np.ndarray  # complex (captures, 2, m)
-    variance: np.ndarray  # real (captures, 2, m)
+    """Mode amplitudes of some captures, complex (captures, 2, m), and the variance that the image noise explains."""
 
-    def relative_to(self, reference: np.ndarray) -> _Amplitudes:
-        """Turn every capture so that the reference spot has the phase it has alone, and take its light away."""
+    values: np.ndarray
+    variance: np.ndarray
+
+    def in_phase_with(self, reference: np.ndarray) -> _Amplitudes:
+        """Turn every capture so that the reference spot has the phase it has alone."""
         overlap = np.einsum("pk,cpk->c", np.conj(reference) * _reference_region(reference), self.values)
-        turned = self.values * np.exp(-1j * np.angle(overlap))[:, None, None]
-        return _Amplitudes(turned - reference, self.variance)
+        return _Amplitudes(self.values * np.exp(-1j * np.angle(overlap))[:, None, None], self.variance)
 
 
 def _reference_region(reference: np.ndarray) -> np.ndarray:
@@ -69,10 +70,10 @@ def retrieve_fields(
     the modes by weighted least squares. The common phase that intensities cannot know is fixed by the reference spot,
     which every capture contains; its own light is then subtracted.
 
-    The stated variance is that of the image noise times an ``inflation`` found from the data: n states of
-    illumination span two dimensions, so n - 2 combinations of the fields must vanish (:func:`closure`), and their
-    mean square in units of the stated variance measures all that the image noise does not explain. It is never taken
-    below 1.
+    The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power,
+    both found from the data: n states of illumination span two dimensions, so n - 2 combinations of the fields must
+    vanish (:func:`fibre.closure.closure_errors`), and how far they do not measures all that the image noise does not
+    explain. With two states there is no such check, and the image noise is all that is stated.
 
     Parameters
     ----------
@@ -89,15 +90,15 @@ def retrieve_fields(
         if fibrelets is None:
             fibrelets = _find(record.images)
         reference = _retrieve(record.references, method, fibrelets, progress, "reference")
-        mean_reference = reference.relative_to(reference.values[0]).values.mean(0) + reference.values[0]
-        fields = _retrieve(record.images, method, fibrelets, progress, "calibration").relative_to(mean_reference)
-        outside = ~_reference_region(mean_reference)
-        inflation = _inflation(fields, record, outside)
+        mean_reference = reference.in_phase_with(reference.values[0]).values.mean(0)
+        fields = _retrieve(record.images, method, fibrelets, progress, "calibration").in_phase_with(mean_reference)
+        noise = _calibration_noise(fields, record, mean_reference)
         return CalibrationFields(
-            fields.values,
-            fields.variance * inflation,
+            fields.values - mean_reference,
+            noise.variance(fields.values, fields.variance),
             mean_reference,
-            inflation,
+            noise.inflation,
+            noise.relative_error,
             fibrelets,
             record.inputs,
             record.points,
@@ -107,20 +108,19 @@ def retrieve_fields(
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
     reference = _retrieve(record.references, method, fibrelets, progress, "reference")
-    mean_reference = reference.relative_to(reference.values[0]).values.mean(0) + reference.values[0]
-    fields = _retrieve(record.images, method, fibrelets, progress, "sample").relative_to(mean_reference)
-    blank = _retrieve(record.blank, method, fibrelets, progress, "blank").relative_to(mean_reference)
-    outside = ~_reference_region(mean_reference)
-    ratios = [
-        closure(part.values[..., outside], part.variance[..., outside], record.illumination) for part in (fields, blank)
-    ]
-    inflation = _mean_ratio(ratios)
+    mean_reference = reference.in_phase_with(reference.values[0]).values.mean(0)
+    fields = _retrieve(record.images, method, fibrelets, progress, "sample").in_phase_with(mean_reference)
+    blank = _retrieve(record.blank, method, fibrelets, progress, "blank").in_phase_with(mean_reference)
+    errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
+    noise = noise_scale(np.concatenate(errors, axis=1))
+    # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
     return RecordingFields(
-        fields.values,
-        fields.variance * inflation,
-        blank.values,
-        blank.variance * inflation,
-        inflation,
+        fields.values - mean_reference,
+        noise.variance(fields.values, fields.variance),
+        blank.values - mean_reference,
+        noise.variance(blank.values, blank.variance),
+        noise.inflation,
+        noise.relative_error,
         fibrelets,
         record.illumination,
     )
@@ -145,9 +145,9 @@ def _retrieve(
     bar = tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not progress)
     for start in range(0, images.captures, batch):
         part = range(start, min(start + batch, images.captures))
-        radiance = np.stack([np.asarray(images.radiance[c]) for c in part])
-        noise = np.stack([np.asarray(images.variance[c]) for c in part])
-        saturated = np.stack([np.asarray(images.saturated[c]) for c in part])
+        # all of one capture before the next: a lazy stack makes its three parts together
+        read = [(images.radiance[c], images.variance[c], images.saturated[c]) for c in part]
+        radiance, noise, saturated = (np.stack([np.asarray(r[i]) for r in read]) for i in range(3))
         noise = np.where(saturated, np.inf, noise)
         diversity = Defocus(
             radiance[:, :planes], images.diversity, images.wavelength, images.pixel_size, noise[:, :planes]
@@ -156,59 +156,43 @@ def _retrieve(
         fringes = relative_phase(radiance[:, planes:], images.steps, 1 / noise[:, planes:])
         for i, capture in enumerate(part):
             h, h_variance = retrieved.field[i].astype(complex), retrieved.variance[i].astype(float)
-            # a pixel is a sample of the field, a mode an integral over it: power per pixel area
-            scale = 1 / images.pixel_size**2
-            power = float((np.abs(h) ** 2).sum()) / scale
+            power = float((np.abs(h) ** 2).sum())
             values[capture, 0], variance[capture, 0] = mode_amplitudes(h, h_variance, modes, power)
             intensity = np.abs(h) ** 2
-            v_intensity = np.maximum(2 * fringes.mean[i] - intensity, 0)
             with np.errstate(divide="ignore", invalid="ignore"):
                 v = fringes.product[i] / np.conj(h)
-                v_variance = (fringes.variance[i] + v_intensity * h_variance) / intensity
+                v_variance = fringes.variance[i] / intensity
             v_variance = np.where(np.isfinite(v) & np.isfinite(v_variance), v_variance, np.inf)
             values[capture, 1], variance[capture, 1] = mode_amplitudes(v, v_variance, modes, power)
+            # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
+            ratio = np.abs(values[capture, 1]) ** 2 / (np.abs(values[capture, 0]) ** 2 + variance[capture, 0])
+            variance[capture, 1] += ratio * variance[capture, 0]
             bar.update()
     bar.close()
     return _Amplitudes(values, variance)
 
 
-def closure(fields: np.ndarray, variance: np.ndarray, states: np.ndarray) -> np.ndarray:
-    r"""Squared closure errors of n fields made by known illumination states, in units of their stated variance.
-
-    n fields that depend linearly on states U (2, n) obey :math:`\sum_k c_k y_k = 0` for every c with U c = 0; there
-    are n - 2 such c. Returns :math:`|\sum c_k y_k|^2 / \sum |c_k|^2 \mathrm{var}_k`, real (n - 2, ...), of mean 1
-    when the variances are true. ``fields``, ``variance``: (n, ...).
-
-    >>> states = np.array([[1, 1, 1], [1, 1j, -1]])
-    >>> fields = np.einsum("an,a->n", states, [0.3, 2j])[:, None]
-    >>> bool(closure(fields, np.ones((3, 1)), states).max() < 1e-25)
-    True
-    """
-    null = scipy.linalg.null_space(np.asarray(states))
-    error = np.einsum("kc,k...->c...", null, fields)
-    expected = np.einsum("kc,k...->c...", np.abs(null) ** 2, variance)
-    return np.abs(error) ** 2 / expected
+def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Closure errors (3, count) outside the reference spot, whose light does not follow the states."""
+    outside = ~_reference_region(reference)
+    values = (fields.values - reference)[..., outside]
+    squared, stated, _ = closure_errors(values, fields.variance[..., outside], states)
+    _, _, power = closure_errors(fields.values[..., outside], fields.variance[..., outside], states)
+    return np.stack([squared, stated, power]).reshape(3, -1)
 
 
-def _mean_ratio(ratios: list[np.ndarray]) -> float:
-    """Mean closure error, never below 1: noise is not believed to be smaller than the image noise."""
-    flat = np.concatenate([r.ravel() for r in ratios]) if ratios else np.zeros(0)
-    return max(1.0, float(flat.mean())) if flat.size else 1.0
-
-
-def _inflation(fields: _Amplitudes, calibration: Calibration, outside: np.ndarray) -> float:
-    """Inflation from the closure of captures that light the same points in different states."""
+def _calibration_noise(fields: _Amplitudes, calibration: Calibration, reference: np.ndarray) -> NoiseScale:
+    """Noise from the closure of captures that light the same points in different states."""
     inputs = calibration.inputs.tocsc()
     count = len(calibration.points)
     groups: dict[tuple[int, ...], list[int]] = {}
     for capture in range(inputs.shape[1]):
         rows = inputs.indices[inputs.indptr[capture] : inputs.indptr[capture + 1]]
         groups.setdefault(tuple(sorted(set(rows % count))), []).append(capture)
-    ratios = []
+    errors = [np.empty((3, 0))]
     for points, captures in groups.items():
-        if len(captures) < 3:
-            continue
         states = inputs[[points[0], points[0] + count], :][:, captures].toarray()
         chosen = np.array(captures)
-        ratios.append(closure(fields.values[chosen][..., outside], fields.variance[chosen][..., outside], states))
-    return _mean_ratio(ratios)
+        part = _Amplitudes(fields.values[chosen], fields.variance[chosen])
+        errors.append(_closure(part, reference, states))
+    return noise_scale(np.concatenate(errors, axis=1))

@@ -249,15 +249,16 @@ class CalibrationFields:
     """Mode amplitudes of every calibration capture, relative to the reference spot.
 
     fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape,
-    E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation:
-    by how much the closure of the illumination states found the retrieval's own variance too small (1 = not at all);
-    ``variance`` contains it. inputs, points, grid, registration: as in :class:`Calibration`.
+    E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation,
+    relative_error: what the closure of the illumination states found beyond the image noise (1 and 0 = nothing);
+    ``variance`` contains both. inputs, points, grid, registration: as in :class:`Calibration`.
     """
 
     fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
     reference: np.ndarray = array(("polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     inflation: float
+    relative_error: float
     fibrelets: Fibrelets = array((), "1")
     inputs: Any = array(("input", "capture"), "1")
     points: np.ndarray = array(("point", "row_column"), "m")
@@ -270,7 +271,7 @@ class RecordingFields:
     """Mode amplitudes of a recording: n states with the sample and n without, in the calibration's fibrelets.
 
     fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real, E|error|^2,
-    ``inflation`` contained. illumination: complex (2, n), nominal.
+    ``inflation`` and ``relative_error`` contained. illumination: complex (2, n), nominal.
     """
 
     fields: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -278,6 +279,7 @@ class RecordingFields:
     blank: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     blank_variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
     inflation: float
+    relative_error: float
     fibrelets: Fibrelets = array((), "1")
     illumination: np.ndarray = array(("polarisation", "state"), "1")
 

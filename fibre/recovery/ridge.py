@@ -48,7 +48,7 @@ class Ridge(RecoveryMethod):
         """See :meth:`RecoveryMethod.solve`."""
         known = columns(fields)
         count, cores = len(fields.points), len(fields.fibrelets.centres)
-        values, variance = known.values.tocsr(), known.variance.tocsr()
+        values, variance = known.values, known.variance
         # noise summed over all inputs, for both polarisations of the input
         ridge = self.strength * np.asarray(variance.sum(axis=1)).ravel()
         observed = np.diff(values.indptr) > 0

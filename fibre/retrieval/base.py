@@ -7,29 +7,37 @@ In: a :class:`fibre.Diversity` (images of one field, or a batch, through known m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
 from fibre.records import Diversity, RetrievalStatus, Retrieved
 from polinfer.checks import one_of_types
 
-__all__ = ["RetrievalMethod", "retrieve"]
+__all__ = ["RetrievalMethod", "Solution", "misfit", "retrieve"]
 
 
 class RetrievalMethod(ABC):
     """A method of phase retrieval: a frozen object of settings with one function."""
 
     @abstractmethod
-    def solve(
-        self, amplitudes: np.ndarray, usable: np.ndarray | None, masks: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> Solution:
         """Fields of a small batch.
 
-        ``amplitudes`` float32 (b, m, y, x), square roots of the images; ``usable`` bool, the same shape, or None for
-        all; ``masks`` complex64 (m, y, x). Returns fields complex64 (b, y, x), whether each converged, bool (b), and
-        the number of iterations, int (b).
+        ``amplitudes`` float32 (b, m, y, x), square roots of the images; ``weights`` float32, the same shape, inverse
+        variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable; ``masks`` complex64 (m, y, x).
         """
+
+
+@dataclass(frozen=True)
+class Solution:
+    """field: complex64 (b, y, x). converged: bool (b). iterations: int (b)."""
+
+    field: np.ndarray
+    converged: np.ndarray
+    iterations: np.ndarray
 
 
 def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, progress: bool = False) -> Retrieved:
@@ -40,7 +48,7 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
 
     The variance of the field is the statistical floor: an amplitude :math:`\sqrt{I}` carries
     :math:`\mathrm{var}(I)/4I`, the m planes are averaged, and the phase quadrature is taken to be as good as the
-    measured one. It does not know of stagnation or of wrong distances; :func:`fibre.retrieve_fields` compares it with
+    measured one; weights are inverse variances. It does not know of stagnation or of wrong distances; :func:`fibre.retrieve_fields` compares it with
     the closure of the illumination states. MISFIT is raised where the mean squared amplitude misfit exceeds twice
     what the image noise explains plus 1 % of the mean intensity.
 
@@ -72,11 +80,12 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     for start in tqdm(range(0, count, batch), desc="phase retrieval", unit="batch", disable=not progress):
         part = slice(start, min(start + batch, count))
         amplitudes = np.sqrt(np.maximum(intensities[part], 0)).astype(np.float32)
-        usable = None if variance is None else np.isfinite(variance[part])
-        found, converged, iterations[part] = method.solve(amplitudes, usable, masks)
-        field[part] = found
-        floor[part], misfit = _noise(found, amplitudes, None if variance is None else variance[part], masks)
-        status[part] = np.where(converged, 0, RetrievalStatus.NOT_CONVERGED) | np.where(misfit, RetrievalStatus.MISFIT, 0)
+        weights, best = _weights(amplitudes, None if variance is None else variance[part])
+        found = method.solve(amplitudes, weights, masks)
+        field[part], iterations[part] = found.field, found.iterations
+        floor[part], misfitted = _noise(found.field, amplitudes, weights, best, masks)
+        status[part] = np.where(found.converged, 0, RetrievalStatus.NOT_CONVERGED)
+        status[part] |= np.where(misfitted, RetrievalStatus.MISFIT, 0).astype(np.uint8)
     shape = tuple(lead)
     spread = np.broadcast_to(floor[:, None, None], field.shape)
     return Retrieved(
@@ -87,24 +96,35 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     )
 
 
+def _weights(amplitudes: np.ndarray, variance: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Relative inverse variances of the amplitudes, (b, m, y, x), and the variance of weight 1, (b)."""
+    if variance is None:
+        return np.ones_like(amplitudes), None
+    usable = np.isfinite(variance)
+    deviation = np.sqrt(np.where(usable, variance, 1))
+    # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
+    spread = deviation**2 / (4 * np.maximum(amplitudes**2, deviation))
+    best = np.where(usable, spread, np.inf).min((1, 2, 3))
+    return np.where(usable, best[:, None, None, None] / spread, 0).astype(np.float32), best
+
+
+def misfit(field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """Weighted mean squared difference between the field's amplitudes and the measured ones, (b)."""
+    views = jnp.abs(jnp.fft.ifft2(jnp.fft.fft2(field)[:, None] * masks))
+    squared = weights * (views - amplitudes) ** 2
+    return np.asarray(squared.sum((1, 2, 3))) / weights.sum((1, 2, 3))
+
+
 def _noise(
-    field: np.ndarray, amplitudes: np.ndarray, variance: np.ndarray | None, masks: np.ndarray
+    field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, best: np.ndarray | None, masks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variance of the complex field from the image noise, and whether the images are misfitted beyond it."""
-    import jax.numpy as jnp
-
-    views = np.asarray(jnp.abs(jnp.fft.ifft2(jnp.fft.fft2(field)[:, None] * masks)))
     images = amplitudes.shape[1]
-    squared = (views - amplitudes) ** 2
-    if variance is None:
+    left = misfit(field, amplitudes, weights, masks)
+    if best is None:
         # nothing known of the noise: what the best fit leaves over is all there is to go by
-        return 2 * squared.mean((1, 2, 3)) / images, np.zeros(len(field), bool)
-    usable = np.isfinite(variance)
-    deviation = np.sqrt(np.where(usable, variance, 0))
-    # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
-    amplitude_variance = deviation**2 / (4 * np.maximum(amplitudes**2, deviation) + 1e-30)
-    weight = usable.sum((1, 2, 3))
-    expected = (amplitude_variance * usable).sum((1, 2, 3)) / weight
-    misfit = (squared * usable).sum((1, 2, 3)) / weight
-    slack = 0.01 * (amplitudes**2 * usable).sum((1, 2, 3)) / weight
-    return 2 * expected / images, misfit > 2 * expected + slack
+        return 2 * left / images, np.zeros(len(field), bool)
+    # sum of w = sum of best / spread: pixels of equal weight would each have this variance
+    expected = best * (weights > 0).sum((1, 2, 3)) / weights.sum((1, 2, 3))
+    slack = 0.01 * (weights * amplitudes**2).sum((1, 2, 3)) / weights.sum((1, 2, 3))
+    return 2 * expected / images, left > 2 * expected + slack

@@ -8,8 +8,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 
-from fibre.retrieval.base import RetrievalMethod
+from fibre.retrieval.base import RetrievalMethod, Solution, misfit
 from polinfer.checks import integer, real_number
 
 __all__ = ["GerchbergSaxton"]
@@ -41,47 +42,60 @@ class GerchbergSaxton(RetrievalMethod):
     iterations: int = 200
     averaging: int = 10
     tolerance: float = 1e-3
+    restarts: int = 2
 
     def __post_init__(self) -> None:
         integer("iterations", self.iterations, low=1)
         integer("averaging", self.averaging, low=0)
         real_number("tolerance", self.tolerance, low=0)
+        integer("restarts", self.restarts, low=0)
 
-    def solve(
-        self, amplitudes: np.ndarray, usable: np.ndarray | None, masks: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
-        mask = None if usable is None or usable.all() else jnp.asarray(usable)
-        field, change, count = _solve(
-            jnp.asarray(amplitudes), mask, jnp.asarray(masks), self.iterations, self.averaging, self.tolerance
-        )
-        converged = np.asarray(change) <= max(self.tolerance, 1e-2)
-        return np.asarray(field), converged, np.full(len(amplitudes), int(count) + self.averaging)
+        settings = (self.iterations, self.averaging, self.tolerance)
+        arguments = (jnp.asarray(amplitudes), jnp.asarray(weights), jnp.asarray(masks))
+        flat = jnp.zeros(amplitudes.shape[-2:], amplitudes.dtype)
+        field, change, count = (np.array(part) for part in _solve(*arguments, flat, *settings))
+        spent = np.full(len(field), count + self.averaging)
+        left = misfit(field, amplitudes, weights, masks)
+        for restart in range(self.restarts):
+            # a stagnated field leaves several times the misfit of its neighbours; noise differs far less
+            suspect = (change > self.tolerance) | (left > 1.5 * np.median(left))
+            if not suspect.any():
+                break
+            phase = np.random.default_rng(restart).uniform(-np.pi, np.pi, flat.shape).astype(amplitudes.dtype)
+            smooth = jnp.asarray(scipy.ndimage.gaussian_filter(phase, 4.0, mode="wrap") * 20)
+            again, moved, count = (np.array(part) for part in _solve(*arguments, smooth, *settings))
+            other = misfit(again, amplitudes, weights, masks)
+            better = suspect & (other < left)
+            field[better], change[better], left[better] = again[better], moved[better], other[better]
+            spent[suspect] += count + self.averaging
+        return Solution(field, change <= max(self.tolerance, 1e-2), spent)
 
 
-def _project(view: jax.Array, amplitude: jax.Array, usable: jax.Array | None) -> jax.Array:
+def _project(view: jax.Array, amplitude: jax.Array, weight: jax.Array) -> jax.Array:
     modulus = jnp.abs(view)
     # a dark pixel has no phase to keep: it stays dark rather than divide by zero
-    corrected = view * (amplitude / jnp.maximum(modulus, 1e-20))
-    return corrected if usable is None else jnp.where(usable, corrected, view)
+    return view * (1 + weight * (amplitude / jnp.maximum(modulus, 1e-20) - 1))
 
 
-@partial(jax.jit, static_argnums=(3, 4))
+@partial(jax.jit, static_argnums=(4, 5))
 def _solve(
     amplitudes: jax.Array,
-    usable: jax.Array | None,
+    weights: jax.Array,
     masks: jax.Array,
+    phase: jax.Array,
     iterations: int,
     averaging: int,
     tolerance: float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     images = masks.shape[0]
     back = jnp.conj(masks)
+    usable = (weights > 0).astype(weights.dtype)
 
     def sweep(spectrum: jax.Array) -> jax.Array:
         for i in range(images):
-            view = jnp.fft.ifft2(spectrum * masks[i])
-            view = _project(view, amplitudes[:, i], None if usable is None else usable[:, i])
+            view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], usable[:, i])
             spectrum = jnp.fft.fft2(view) * back[i]
         return spectrum
 
@@ -97,9 +111,9 @@ def _solve(
 
     def average(_: int, spectrum: jax.Array) -> jax.Array:
         view = jnp.fft.ifft2(spectrum[:, None] * masks)
-        return (jnp.fft.fft2(_project(view, amplitudes, usable)) * back).mean(1)
+        return (jnp.fft.fft2(_project(view, amplitudes, weights)) * back).mean(1)
 
-    first = jnp.fft.fft2(amplitudes[:, 0].astype(masks.dtype)) * back[0]
+    first = jnp.fft.fft2(amplitudes[:, 0] * jnp.exp(1j * phase)) * back[0]
     start = (first, jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype), jnp.array(0))
     spectrum, change, count = jax.lax.while_loop(unfinished, step, start)
     spectrum = jax.lax.fori_loop(0, averaging, average, spectrum)

@@ -1,0 +1,1 @@
+"""The simulated bench: a scene and its camera."""

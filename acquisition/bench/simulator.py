@@ -1,0 +1,135 @@
+"""A bench that exists only in numbers, behind the same contract as a real one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, fields
+from typing import Any
+
+import numpy as np
+import scipy.ndimage
+
+from acquisition.bench.scene import Scene
+from acquisition.exposure import InverseVariance
+from acquisition.plan import Step, Views
+from polinfer import RetarderFirst
+from polinfer.checks import as_generator, one_of_types
+
+__all__ = ["SimulatedBench"]
+
+
+class SimulatedBench:
+    """The bench of a :class:`Scene`: hologram -> sample -> bundle -> second modulator -> camera.
+
+    Frames depend on (seed, step, view, exposure) only, so an interrupted run that is resumed sees the same frames.
+    ``ordering`` of the sample's elements is the phantom's (retarder first).
+    """
+
+    def __init__(self, scene: Scene, rng: int | np.random.Generator | None = None) -> None:
+        one_of_types("scene", scene, (Scene,), "pass Scene(bundle, phantom, ...).")
+        generator, seed = as_generator(rng)
+        self.scene = scene
+        self.seed = int(generator.integers(1 << 62)) if seed is None else seed
+        self.wavelength = scene.bundle.wavelength
+        self.pixel_size = scene.camera.pixel_size
+        self.full_scale = scene.camera.full_scale
+        self.merge_rule = InverseVariance(scene.camera.gain, scene.camera.read_noise)
+        self.registration = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+        self._step: Step | None = None
+        self._rates: np.ndarray | None = None
+        self._clock = 0.0
+        self._sample = self._sample_field()
+
+    def describe(self) -> dict[str, Any]:
+        """See :class:`acquisition.contracts.Bench`."""
+        settings = {
+            f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
+        }
+        digest = hashlib.sha256(self._sample[0].tobytes() + self.scene.bundle.transfer.data.tobytes()).hexdigest()
+        described = {"bench": "simulated", "seed": self.seed, "scene": settings, "contents": digest}
+        return json.loads(json.dumps(described | {"camera": asdict(self.scene.camera)}))
+
+    def time(self) -> float:
+        """Seconds; the simulated clock advances by each exposure."""
+        return self._clock
+
+    def prepare(self, step: Step, views: Views, illumination: np.ndarray, points: np.ndarray | None) -> None:
+        """See :class:`acquisition.contracts.Bench`."""
+        scene = self.scene
+        state = illumination[:, step.state]
+        spot = scene.bundle.launch(np.array([scene.reference]), scene.spot_waist)
+        launched = scene.reference_amplitude * np.outer([1, 1], spot.toarray()[:, 0]) / np.sqrt(2) + 0j
+        if step.kind == "spots":
+            if points is None:
+                raise ValueError("points must be given for a step that lights spots.")
+            spots = scene.bundle.launch(points[list(step.points)], scene.spot_waist)
+            launched += np.outer(state, np.asarray(spots.sum(axis=1)).ravel())
+        elif step.kind in ("blank", "sample"):
+            places, light, jones, waist = self._sample[1:]
+            field = light[:, None] * state if step.kind == "blank" else light[:, None] * (jones @ state)
+            launched += (scene.bundle.launch(places, waist) @ field).T
+        self._rates = self._views(scene.bundle.propagate(launched), views, step)
+        self._step = step
+
+    def expose(self, view: int, exposure: float) -> np.ndarray:
+        """See :class:`acquisition.contracts.Bench`."""
+        if self._rates is None or self._step is None:
+            raise RuntimeError("prepare a step before exposing.")
+        camera = self.scene.camera
+        self._clock += exposure
+        mean = self._rates[view] * exposure
+        key = hashlib.sha256(f"{self._step.id}|{view}|{exposure!r}".encode()).digest()
+        generator = np.random.default_rng([self.seed, *np.frombuffer(key, np.uint32).tolist()])
+        electrons = _shot_noise(mean, generator) if camera.shot_noise else mean
+        if camera.read_noise:
+            electrons = electrons + camera.read_noise * generator.standard_normal(mean.shape, np.float32)
+        counts = np.clip(np.rint(electrons / camera.gain), 0, camera.full_scale)
+        return counts.astype(np.uint8 if camera.bits <= 8 else np.uint16)
+
+    def _sample_field(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Jones matrices on the grid, and places, light, Jones matrices and spot size of the finer sample."""
+        scene = self.scene
+        parameters, gain = scene.phantom.parameters, scene.phantom.gain
+        jones = np.asarray(RetarderFirst().jones(parameters))
+        if gain is not None:
+            jones = jones * np.asarray(gain)[..., None, None]
+        rows, columns = jones.shape[:2]
+        fine = scene.sample_oversampling
+        index = [(np.arange(n * fine) + 0.5) / fine - 0.5 for n in (rows, columns)]
+        grid = np.stack(np.meshgrid(*index, indexing="ij"))
+        elements = [
+            scipy.ndimage.map_coordinates(jones[..., i, j], grid, order=3, mode="nearest") for i in (0, 1) for j in (0, 1)
+        ]
+        finer = np.stack(elements, -1).reshape(-1, 2, 2)
+        middle = (np.array([rows, columns]) - 1) / 2
+        places = (grid.reshape(2, -1).T - middle) * scene.pitch
+        waist = scene.spot_waist if fine == 1 else max(scene.pitch / fine, 0.6 * scene.spot_waist)
+        # a lattice of unit-power Gaussians of waist w and spacing h adds up to a flat field in proportion to w / h^2
+        share = (scene.spot_waist / waist) / fine**2
+        light = scene.illumination * share * np.exp(-(places**2).sum(1) / scene.illumination_waist**2)
+        return jones, places, light, finer, waist
+
+    def _views(self, amplitudes: np.ndarray, views: Views, step: Step) -> np.ndarray:
+        """Photo-electrons per second of every view, real (image, y, x)."""
+        scene, camera = self.scene, self.scene.camera
+        key = hashlib.sha256(f"{step.id}|steps".encode()).digest()
+        generator = np.random.default_rng([self.seed, *np.frombuffer(key, np.uint32).tolist()])
+        distances = np.array([0.0, *(d * (1 + scene.focus_error) + scene.focus_offset for d in views.diversity)])
+        distances[0] = scene.focus_offset
+        seen = scene.bundle.image(amplitudes, camera.shape, camera.pixel_size, distances, scene.oversampling)
+        rates = [np.abs(seen[1 + i, 0]) ** 2 for i in range(len(views.diversity))]
+        errors = scene.step_error * generator.standard_normal(len(views.steps))
+        for phase in np.array(views.steps) + errors:
+            rates.append(np.abs(seen[0, 0] + np.exp(1j * phase) * seen[0, 1]) ** 2 / 2)
+        fine = scene.oversampling
+        binned = np.stack(rates).reshape(len(rates), camera.shape[0], fine, camera.shape[1], fine).mean((2, 4))
+        return scene.spot_power * camera.pixel_size**2 * binned
+
+
+def _shot_noise(mean: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Poisson photo-electrons; from 50 upwards by the normal limit, whose skew (0.14) no rounding to counts shows."""
+    electrons = (mean + np.sqrt(mean) * generator.standard_normal(mean.shape, np.float32)).astype(np.float32)
+    few = mean < 50
+    electrons[few] = generator.poisson(mean[few])
+    return electrons

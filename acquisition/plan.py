@@ -1,0 +1,196 @@
+"""What is to be captured, as data: ordered steps with ids, a hash, and a duration on paper.
+
+In: sizes and settings. Out: a plan that any bench can execute and anyone can read. Called by ``calibrate`` and
+``capture``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse
+
+from acquisition.exposure import Bracket
+from polinfer.checks import integer, one_of_types, real_array, real_number
+
+__all__ = ["CalibrationPlan", "Plan", "SamplePlan", "Step", "Timing", "Views", "elliptical_states"]
+
+
+def elliptical_states(count: int = 3) -> np.ndarray:
+    r"""Balanced states :math:`(1, e^{2 \pi i k / n}) / \sqrt 2`, complex (2, n): sum of u u^H is n/2 times identity.
+
+    >>> u = elliptical_states(3)
+    >>> bool(np.allclose(u @ u.conj().T, 1.5 * np.eye(2)))
+    True
+    """
+    count = integer("count", count, low=2)
+    return np.stack([np.ones(count), np.exp(2j * np.pi * np.arange(count) / count)]) / np.sqrt(2)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds one image takes; the default is the paper's 8.3 s for the 11 images of a capture."""
+
+    image: float = 8.3 / 11
+
+
+@dataclass(frozen=True)
+class Step:
+    """One capture: what is lit. ``kind`` is reference (the reference spot alone), spots, blank or sample; ``points``
+    are the lit distal points of a spots step, ``state`` the column of the plan's states."""
+
+    id: str
+    kind: str
+    points: tuple[int, ...] = ()
+    state: int = 0
+
+
+@dataclass(frozen=True)
+class Views:
+    """The images of one capture, and how each is exposed.
+
+    diversity: (m,) metres of defocus of the H images. steps: (k,) radians of V against H in the interference images,
+    k >= 3. bracket: exposures of every image.
+    """
+
+    diversity: tuple[float, ...] = tuple(np.linspace(-100e-6, 100e-6, 7).tolist())
+    steps: tuple[float, ...] = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
+    bracket: Bracket = Bracket(longest=16e-3, factor=2.0, stop=0.25e-3)
+
+    def __post_init__(self) -> None:
+        for name in ("diversity", "steps"):
+            values = real_array(name, getattr(self, name), shape=(None,), finite=True)
+            object.__setattr__(self, name, tuple(values.tolist()))
+        one_of_types("bracket", self.bracket, (Bracket,), "pass Bracket(longest, factor, stop).")
+
+    def __len__(self) -> int:
+        return len(self.diversity) + len(self.steps)
+
+
+class Plan(ABC):
+    """An ordered list of captures that share their views and illumination states."""
+
+    views: Views
+    states: int
+
+    @cached_property
+    @abstractmethod
+    def captures(self) -> tuple[Step, ...]:
+        """The steps in order."""
+
+    @property
+    def illumination(self) -> np.ndarray:
+        """The states, complex (2, n)."""
+        return elliptical_states(self.states)
+
+    def duration(self, timing: Timing) -> float:
+        """Seconds that the plan takes on paper.
+
+        >>> round(SamplePlan(blank=False, references=0).duration(Timing()), 1)  # the paper's 24.9 s
+        24.9
+        """
+        one_of_types("timing", timing, (Timing,), "pass Timing(image=seconds).")
+        return len(self.captures) * len(self.views) * timing.image
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything that decides what is captured; a resumed run must have the same."""
+        text = json.dumps([type(self).__name__, repr(self), [repr(step) for step in self.captures]])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class CalibrationPlan(Plan):
+    """Every distal point lit in every state, spots that are ``stride`` points apart at the same time.
+
+    grid: (rows, columns) of distal points. pitch: metres between them. stride: points between parallel spots, per
+    axis; stride^2 translations cover the grid. states: number of illumination states, >= 2. reference_every: captures
+    between images of the reference spot alone (the paper's 60 s are 7 captures). views: images of a capture.
+
+    >>> plan = CalibrationPlan(grid=(4, 6), stride=2)
+    >>> sum(step.kind == "spots" for step in plan.captures)  # 4 translations x 3 states
+    12
+    """
+
+    grid: tuple[int, int] = (18, 18)
+    pitch: float = 4.2e-6
+    stride: int = 4
+    states: int = 3
+    reference_every: int = 7
+    views: Views = field(default_factory=Views)
+
+    def __post_init__(self) -> None:
+        rows, columns = self.grid
+        object.__setattr__(self, "grid", (integer("grid", rows, low=1), integer("grid", columns, low=1)))
+        real_number("pitch", self.pitch, above=0)
+        integer("stride", self.stride, low=1)
+        integer("states", self.states, low=2)
+        integer("reference_every", self.reference_every, low=1)
+        one_of_types("views", self.views, (Views,), "pass Views(...).")
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Distal points, (p, 2) metres, row by row, centred."""
+        rows, columns = self.grid
+        index = np.stack(np.mgrid[:rows, :columns], -1).reshape(-1, 2)
+        return (index - (np.array(self.grid) - 1) / 2) * self.pitch
+
+    @cached_property
+    def captures(self) -> tuple[Step, ...]:
+        """See :class:`Plan`."""
+        index = np.arange(self.grid[0] * self.grid[1]).reshape(self.grid)
+        spots = []
+        for row in range(min(self.stride, self.grid[0])):
+            for column in range(min(self.stride, self.grid[1])):
+                lit = tuple(int(i) for i in index[row :: self.stride, column :: self.stride].ravel())
+                for state in range(self.states):
+                    spots.append(Step(f"spots-{row}-{column}-state-{state}", "spots", lit, state))
+        steps: list[Step] = []
+        for count, spot in enumerate(spots):
+            if count % self.reference_every == 0:
+                steps.append(Step(f"reference-{count // self.reference_every}", "reference"))
+            steps.append(spot)
+        steps.append(Step("reference-last", "reference"))
+        return tuple(steps)
+
+    @property
+    def inputs(self) -> scipy.sparse.csr_array:
+        """Amplitudes at the points in every spots step, sparse complex (2 p, captures)."""
+        count = len(self.points)
+        spots = [step for step in self.captures if step.kind == "spots"]
+        row, column, value = [], [], []
+        for capture, step in enumerate(spots):
+            for polarisation in range(2):
+                row += [polarisation * count + point for point in step.points]
+                column += [capture] * len(step.points)
+                value += [self.illumination[polarisation, step.state]] * len(step.points)
+        return scipy.sparse.csr_array((np.array(value), (row, column)), shape=(2 * count, len(spots)))
+
+
+@dataclass(frozen=True)
+class SamplePlan(Plan):
+    """The sample in every state, with captures of the reference spot and (``blank``) of the scene without a sample."""
+
+    states: int = 3
+    blank: bool = True
+    references: int = 2
+    views: Views = field(default_factory=Views)
+
+    def __post_init__(self) -> None:
+        integer("states", self.states, low=2)
+        integer("references", self.references, low=0)
+        one_of_types("views", self.views, (Views,), "pass Views(...).")
+
+    @cached_property
+    def captures(self) -> tuple[Step, ...]:
+        """See :class:`Plan`."""
+        steps = [Step(f"reference-{i}", "reference") for i in range(self.references)]
+        if self.blank:
+            steps += [Step(f"blank-state-{state}", "blank", (), state) for state in range(self.states)]
+        steps += [Step(f"sample-state-{state}", "sample", (), state) for state in range(self.states)]
+        return tuple(steps)

@@ -1,0 +1,167 @@
+"""Raw frames on disk and the manifest that says which are complete.
+
+One file of raw frames per capture, written under another name, flushed to the disk and renamed; then one line in an
+append-only manifest, flushed too. A capture exists when its line does. In: frames. Out: lazily merged images. Called
+by the run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from acquisition.exposure import Merged, MergeRule, merge_exposures
+
+__all__ = ["Folder", "MergedStack"]
+
+MANIFEST = "manifest.jsonl"
+
+
+class Folder:
+    """A run's folder. A new one gets ``header`` as its first line; an old one must have been made by the same."""
+
+    def __init__(self, path: str | Path, header: dict[str, Any]) -> None:
+        self.path = Path(path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.manifest = self.path / MANIFEST
+        self.done: dict[str, dict[str, Any]] = {}
+        lines = self._read()
+        if not lines:
+            self._append(header)
+            return
+        if lines[0] != header:
+            differing = sorted(k for k in {*lines[0], *header} if lines[0].get(k) != header.get(k))
+            raise ValueError(
+                f"folder {self.path} belongs to another run ({', '.join(differing)} differ); choose another folder."
+            )
+        self.done = {line["id"]: line for line in lines[1:]}
+
+    def _read(self) -> list[dict[str, Any]]:
+        if not self.manifest.exists():
+            return []
+        raw = self.manifest.read_bytes()
+        whole = raw[: raw.rfind(b"\n") + 1]
+        if len(whole) < len(raw):
+            # a torn last line: the capture it speaks of was never acknowledged
+            with open(self.manifest, "r+b") as file:
+                file.truncate(len(whole))
+        try:
+            lines = [json.loads(line) for line in whole.splitlines()]
+        except json.JSONDecodeError as error:
+            raise ValueError(f"folder {self.path} has a damaged {MANIFEST} ({error}); it cannot be resumed.") from error
+        if not all(isinstance(line, dict) for line in lines) or any("id" not in line for line in lines[1:]):
+            raise ValueError(f"folder {self.path} has a foreign {MANIFEST}; choose another folder.")
+        return lines
+
+    def _append(self, line: dict[str, Any]) -> None:
+        with open(self.manifest, "ab") as file:
+            file.write(json.dumps(line).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        self._sync_directory()
+
+    def _sync_directory(self) -> None:
+        descriptor = os.open(self.path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def store(self, identity: str, frames: list[np.ndarray], exposures: list[list[float]], time: float) -> None:
+        """Keep one capture: ``frames[i]`` are the raw exposures (k, y, x) of image i."""
+        name = f"{identity}.npz"
+        part = self.path / f".{name}.part"
+        with open(part, "wb") as file:
+            np.savez(file, **{f"image_{i:03d}": frame for i, frame in enumerate(frames)})
+            file.flush()
+            os.fsync(file.fileno())
+        digest = hashlib.sha256(part.read_bytes()).hexdigest()
+        size = part.stat().st_size
+        os.replace(part, self.path / name)
+        self._sync_directory()
+        line = {"id": identity, "file": name, "bytes": size, "sha256": digest, "exposures": exposures, "time": time}
+        self._append(line)
+        self.done[identity] = line
+
+    def load(self, identity: str) -> tuple[list[np.ndarray], list[list[float]]]:
+        """Raw frames and exposures of a capture, checked against the manifest."""
+        line = self.done[identity]
+        path = self.path / f"{identity}.npz"
+        raw = path.read_bytes() if path.exists() else b""
+        if hashlib.sha256(raw).hexdigest() != line["sha256"]:
+            raise ValueError(f"folder {self.path}: {path.name} is damaged or missing; delete its line in {MANIFEST} to "
+                             "take it again.")  # fmt: skip
+        with np.load(path, allow_pickle=False) as stored:
+            frames = [stored[f"image_{i:03d}"] for i in range(len(line["exposures"]))]
+        return frames, line["exposures"]
+
+    def complete(self, identity: str) -> bool:
+        """Whether the capture is in the manifest and its file has the stated size."""
+        if identity not in self.done:
+            return False
+        path = self.path / f"{identity}.npz"
+        return path.exists() and path.stat().st_size == self.done[identity]["bytes"]
+
+
+@dataclass(frozen=True)
+class MergedStack:
+    """A (capture, image, y, x) array that merges raw exposures when a capture is asked for.
+
+    ``part`` picks radiance, variance or saturated. The last capture merged is remembered, since all three are asked
+    for in turn.
+    """
+
+    folder: Folder
+    identities: tuple[str, ...]
+    full_scale: int
+    rule: MergeRule
+    shape: tuple[int, int, int, int]
+    part: Callable[[Merged], np.ndarray]
+    cache: dict[str, list[Merged]]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """float32, or bool for the saturation mask."""
+        return np.dtype(bool) if self.part is SATURATED else np.dtype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self.identities)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        identity = self.identities[index]
+        if identity not in self.cache:
+            frames, exposures = self.folder.load(identity)
+            merged = [
+                merge_exposures(f, t, self.full_scale, self.rule) for f, t in zip(frames, exposures, strict=True)
+            ]
+            self.cache.clear()
+            self.cache[identity] = merged
+        return np.stack([self.part(m) for m in self.cache[identity]]).astype(self.dtype)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        if copy is False:
+            raise ValueError("a lazy stack cannot be an array without a copy.")
+        whole = np.stack([self[i] for i in range(len(self))])
+        return whole if dtype is None else whole.astype(dtype)
+
+
+def RADIANCE(merged: Merged) -> np.ndarray:  # noqa: N802
+    """The radiance of a merged image."""
+    return merged.radiance
+
+
+def VARIANCE(merged: Merged) -> np.ndarray:  # noqa: N802
+    """The variance of a merged image."""
+    return merged.variance
+
+
+def SATURATED(merged: Merged) -> np.ndarray:  # noqa: N802
+    """The saturation mask of a merged image."""
+    return merged.saturated
