@@ -38,11 +38,17 @@ class _Best(NamedTuple):
 def _canonical(model: Model, parameters: Parameters, statistics: Statistics) -> Parameters:
     """Of the equivalent copies with the highest density, the one nearest to the reference."""
     copies = equivalent(model, parameters)
-    density = np.asarray(log_density(model, copies, statistics))
-    density = np.where(np.isnan(density), -np.inf, density)
+    prior = np.asarray(model.log_prior(copies))
+    likelihood = np.asarray(log_density(model, copies, statistics)) - np.where(np.isfinite(prior), prior, 0)
+    likelihood = np.where(np.isnan(likelihood), -np.inf, likelihood)
+    # Likelihoods of copies differ by rounding only, eps times the signal-to-noise ratio, unless an ordering of the
+    # user's own breaks the symmetry.
+    strength = np.sqrt(np.sum(np.abs(np.asarray(statistics.illumination)) ** 2, axis=(-1, -2)))
+    rounding = 30 * np.finfo(prior.dtype).eps * (1 + strength)
+    highest = likelihood.max(axis=0)
+    density = prior + np.where(likelihood >= highest - rounding, highest, likelihood)
     slack = 1e-6 if density.dtype == np.float64 else 1e-3
-    best = density.max(axis=0)
-    allowed = density >= best - slack * (1 + 1e-3 * np.abs(best))
+    allowed = density >= density.max(axis=0) - slack
     return nearest(copies, Parameters(*(np.asarray(x, density.dtype) for x in REFERENCE)), allowed)
 
 

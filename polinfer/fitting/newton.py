@@ -60,9 +60,11 @@ def value_gradient_hessian(
 def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
     """One iteration of one problem."""
     dtype = state.point.dtype
-    eps, enough = jnp.finfo(dtype).eps, tolerance(np.dtype(dtype))
+    eps = jnp.finfo(dtype).eps
     # Unit diagonal: what the prior says of a parameter that the data do not see is not lost beside a curvature of 1e16.
     scale = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(state.hessian)), 1e-3))
+    # the slope is rounded like eps times the square of the signal-to-noise ratio, the step like eps times that ratio
+    enough = tolerance(np.dtype(dtype)) + 10 * (eps * jnp.max(scale)) ** 2
     curvature, axes = jnp.linalg.eigh(-state.hessian / (scale[:, None] * scale))
     floor = 30 * eps
     slope = axes.T @ (state.gradient / scale)

@@ -434,3 +434,15 @@ def test_the_gain_is_recovered():
 def test_wrong_arguments_are_named(call, error, text):
     with pytest.raises(error, match=text):
         call()
+
+
+def test_float32_keeps_its_promise_up_to_a_signal_of_100000():
+    scene = polinfer.phantoms.lesion((8, 8), rng=1)
+    data = simulate(Model(), scene.parameters, BALANCED.astype(np.complex64), 1e-5, rng=2)
+    single = Measurement(data.illumination, data.response.astype(np.complex64), data.sigma.astype(np.float32))
+    result = fit(Model(), single)
+    truth = canonicalise(scene.parameters)
+    for name in Parameters._fields:
+        assert np.abs(getattr(result.parameters, name) - getattr(truth, name)).max() < 1e-3
+    assert np.median(np.abs(result.parameters.retardance - truth.retardance) / result.std.retardance) < 1.5
+    assert not np.any(result.status & int(Status.NOT_CONVERGED))

@@ -1,0 +1,93 @@
+"""How far a fit is from a known truth, in units of its own uncertainty."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .checks import complex_array, one_of_types
+from .records import Fit, Parameters
+
+__all__ = ["jones_chi_square"]
+
+
+def jones_chi_square(fit: Fit, jones: Any) -> tuple[np.ndarray, np.ndarray]:
+    r"""Squared distance of the fitted from the true Jones matrix, in units of the fit's covariance.
+
+    Angles are not compared, for they jump at degenerate points; the eight elements of J (real and imaginary) do not
+    depend on which of the equivalent parameter sets is reported. With :math:`G = dJ/d(\mathrm{parameters})`,
+
+    .. math:: \chi^2 = \delta^T (P G C G^T P)^+ \delta, \quad \delta = P (J_{fit} - J_{true})
+
+    where C is the fit's covariance. With a free gain the true matrix is scaled and turned onto the fitted one, and P
+    takes out the directions that the gain covers (J and iJ; only iJ for a :class:`PhaseGain`), so a true matrix may
+    carry any complex factor. Its expectation is the second value returned: the number of directions in which the fit
+    claims an uncertainty, 5 where all parameters are free and none degenerate.
+
+    Parameters
+    ----------
+    fit: pixel shape P. jones: complex ``(*P, 2, 2)``, the truth.
+
+    Returns
+    -------
+    chi_square, degrees_of_freedom: shape P; NaN and 0 where the fit has no answer.
+
+    Raises
+    ------
+    ValueError, TypeError: shapes and types.
+
+    >>> import polinfer
+    >>> truth = Parameters(0.3, 0.5, 1.2, 0.4, np.full(400, 0.2))
+    >>> model = polinfer.Model()
+    >>> states = np.array([[1, 1, 1], [1, 1j, -1]]) / 2**0.5
+    >>> result = polinfer.fit(model, polinfer.simulate(model, truth, states, sigma=0.01, rng=1))
+    >>> chi_square, freedom = jones_chi_square(result, model.jones(truth))
+    >>> bool(abs(chi_square.sum() / freedom.sum() - 1) < 5 * (2 / freedom.sum()) ** 0.5)
+    True
+    """
+    one_of_types("fit", fit, (Fit,), "pass the result of fit().")
+    truth = complex_array("jones", jones, trailing=(2, 2))
+    shape = fit.status.shape
+    if truth.shape[:-2] != shape:
+        raise ValueError(f"jones has pixel shape {truth.shape[:-2]}, the fit {shape}; they must agree.")
+    model = fit.model
+    complete = model.complete(Parameters(*(np.asarray(x, float) for x in fit.parameters)))
+    points = np.stack([np.broadcast_to(np.asarray(x, float), shape).ravel() for x in complete], axis=-1)
+    known = np.isfinite(points).all(-1)
+
+    def elements(vector: jax.Array) -> jax.Array:
+        flat = model.ordering.jones(Parameters(*vector)).ravel()
+        return jnp.concatenate([flat.real, flat.imag])
+
+    safe = jnp.asarray(np.where(known[:, None], points, 0.1))
+    slope = np.asarray(jax.vmap(jax.jacfwd(elements))(safe), float)
+    fitted = np.asarray(jax.vmap(elements)(safe), float)
+    true = truth.reshape(-1, 4).astype(complex)
+    if model.known_gain.free_phase:
+        matrix = fitted[:, :4] + 1j * fitted[:, 4:]
+        overlap = (np.conj(true) * matrix).sum(-1)
+        if model.known_gain.real_parameters == 1:
+            factor = overlap / np.abs(overlap)
+        else:
+            factor = overlap / (np.abs(true) ** 2).sum(-1)
+        true = true * factor[:, None]
+    delta = np.concatenate([true.real, true.imag], -1) - fitted
+    directions = np.zeros((len(points), 8, 0))
+    if model.known_gain.free_phase:
+        turned = np.concatenate([-fitted[:, 4:], fitted[:, :4]], -1)
+        parts = [turned] if model.known_gain.real_parameters == 1 else [turned, fitted]
+        directions = np.stack([part / np.linalg.norm(part, axis=-1, keepdims=True) for part in parts], -1)
+    project = np.eye(8) - directions @ directions.swapaxes(-1, -2)
+    slope, delta = project @ slope, (project @ delta[..., None])[..., 0]
+    covariance = np.where(known[:, None, None], np.asarray(fit.covariance, float).reshape(-1, 5, 5), 0)
+    known = known & np.isfinite(covariance).all((-1, -2))
+    spread = slope @ np.where(known[:, None, None], covariance, 0) @ slope.swapaxes(-1, -2)
+    values, vectors = np.linalg.eigh(spread)
+    claimed = values > 1e-6 * values[:, -1:]
+    along = np.einsum("nij,ni->nj", vectors, delta) ** 2
+    chi_square = np.where(claimed, along / np.where(claimed, values, 1), 0).sum(-1)
+    freedom = np.where(known, claimed.sum(-1), 0)
+    return np.where(known, chi_square, np.nan).reshape(shape), freedom.reshape(shape)
