@@ -1,0 +1,28 @@
+"""Capture: benches, plans, exposures, runs; and a bench that is simulated whole."""
+
+from .bench.scene import CameraModel, Scene
+from .bench.simulator import SimulatedBench
+from .contracts import Bench
+from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
+from .plan import CalibrationPlan, SamplePlan, Step, Timing, Views, elliptical_states
+from .run import calibrate, capture
+
+__all__ = [
+    "Bench",
+    "Bracket",
+    "CalibrationPlan",
+    "CameraModel",
+    "InverseVariance",
+    "LongestUnsaturated",
+    "Merged",
+    "SamplePlan",
+    "Scene",
+    "SimulatedBench",
+    "Step",
+    "Timing",
+    "Views",
+    "calibrate",
+    "capture",
+    "elliptical_states",
+    "merge_exposures",
+]

@@ -58,9 +58,9 @@ class Views:
     k >= 3. bracket: exposures of every image.
     """
 
-    diversity: tuple[float, ...] = tuple(np.linspace(-100e-6, 100e-6, 7).tolist())
+    diversity: tuple[float, ...] = tuple(np.linspace(-120e-6, 120e-6, 7).tolist())
     steps: tuple[float, ...] = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
-    bracket: Bracket = Bracket(longest=16e-3, factor=2.0, stop=0.25e-3)
+    bracket: Bracket = Bracket(longest=64e-3, factor=2.0, stop=0.25e-3)
 
     def __post_init__(self) -> None:
         for name in ("diversity", "steps"):

@@ -1,8 +1,15 @@
 """From raw intensity images of a fibre bundle to Jones data."""
 
-from fibre.bundle import Bundle
-from fibre.propagation import angular_spectrum
-from fibre.records import (
+from polinfer.storage import save
+
+from .bundle import Bundle
+from .fibrelets import find_fibrelets
+from .fields import retrieve_fields
+from .files import load
+from .interference import relative_phase
+from .propagation import angular_spectrum
+from .reconstruction import reconstruct
+from .records import (
     Calibration,
     CalibrationFields,
     Defocus,
@@ -16,11 +23,34 @@ from fibre.records import (
     RetrievalStatus,
     Retrieved,
 )
-from fibre.retrieval.base import retrieve
-from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
-from fibre.fibrelets import find_fibrelets
-from fibre.fields import retrieve_fields
-from fibre.interference import relative_phase
-from fibre.reconstruction import reconstruct
-from fibre.recovery.base import recover
-from fibre.recovery.ridge import Ridge
+from .recovery.base import recover
+from .recovery.ridge import Ridge
+from .retrieval.base import retrieve
+from .retrieval.gerchberg_saxton import GerchbergSaxton
+
+__all__ = [
+    "Bundle",
+    "Calibration",
+    "CalibrationFields",
+    "Defocus",
+    "Diversity",
+    "Fibrelets",
+    "GerchbergSaxton",
+    "Images",
+    "Interference",
+    "Inverse",
+    "Recording",
+    "RecordingFields",
+    "RetrievalStatus",
+    "Retrieved",
+    "Ridge",
+    "angular_spectrum",
+    "find_fibrelets",
+    "load",
+    "reconstruct",
+    "recover",
+    "relative_phase",
+    "retrieve",
+    "retrieve_fields",
+    "save",
+]

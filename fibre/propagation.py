@@ -6,6 +6,7 @@ planes of defocus are transfer functions of the second modulator) and by anyone 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import jax.numpy as jnp
@@ -39,7 +40,15 @@ def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, 
     """
     wavelength = real_number("wavelength", wavelength, above=0)
     pixel_size = real_number("pixel_size", pixel_size, above=0)
-    distance = real_array("distance", distance, finite=True)[..., None, None]
+    distance = np.asarray(real_array("distance", distance, finite=True), np.float64)
+    values = _transfer(tuple(shape), distance.tobytes(), wavelength, pixel_size)
+    return values.reshape(*distance.shape, *shape)
+
+
+@lru_cache(maxsize=4)
+def _transfer(shape: tuple[int, int], distances: bytes, wavelength: float, pixel_size: float) -> np.ndarray:
+    """The masks of :func:`transfer_function`, kept: a run asks for the same ones at every capture."""
+    distance = np.frombuffer(distances)[:, None, None]
     fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
     squared = 1 / wavelength**2 - fy[:, None] ** 2 - fx[None, :] ** 2
     propagating = squared > 0
@@ -48,7 +57,9 @@ def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, 
     inside = propagating
     for f, n in ((fy[:, None], shape[0]), (fx[None, :], shape[1])):
         inside = inside & (np.abs(distance * f / axial) <= n * pixel_size / 2)
-    return np.where(inside, np.exp(1j * phase), 0.0)
+    masks = np.where(inside, np.exp(1j * phase), 0.0)
+    masks.flags.writeable = False
+    return masks
 
 
 def angular_spectrum(field: Any, distance: float, wavelength: float, pixel_size: float) -> np.ndarray:

@@ -60,7 +60,7 @@ class Scene:
     pitch: float = 4.2e-6
     spot_power: float = 2e8
     spot_waist: float = 2.5e-6
-    illumination: float = 0.5
+    illumination: float = 0.2
     illumination_waist: float = 60e-6
     reference: tuple[float, float] = (0.0, 49e-6)
     reference_amplitude: float = 1.0
@@ -77,7 +77,7 @@ class Scene:
             real_number(name, getattr(self, name), above=0)
         for name in ("illumination", "reference_amplitude", "step_error"):
             real_number(name, getattr(self, name), low=0)
-        if np.shape(self.phantom.parameters.retardance).__len__() != 2:
+        if np.ndim(self.phantom.parameters.retardance) != 2:
             raise ValueError("phantom must be a frame (y, x); give its parameters two axes.")
         integer("oversampling", self.oversampling, low=1)
         integer("sample_oversampling", self.sample_oversampling, low=1)

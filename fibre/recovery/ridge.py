@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 import scipy.spatial
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from fibre.calibration import columns
@@ -64,7 +65,9 @@ class Ridge(RecoveryMethod):
             block = values[chosen]
             gram = (block @ block.conj().T).toarray() + np.diag(ridge[chosen])
             target = block[:, [point, point + count]].toarray()  # a = e A^H (A A^H + L)^-1
-            row = scipy.linalg.solve(gram, target, assume_a="pos").conj().T
+            # a hundred unknowns: threads would cost more than they bring, and fight with other programs
+            with threadpool_limits(1, user_api="blas"):
+                row = scipy.linalg.solve(gram, target, assume_a="pos").conj().T
             rows.append(np.repeat([point, point + count], len(chosen)))
             cols.append(np.tile(chosen, 2))
             data.append(row.ravel())

@@ -1,0 +1,74 @@
+"""Commands that this package adds to ``polinfer``: retrieve, recover, reconstruct."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+__all__ = ["reconstruct_command", "recover_command", "retrieve_command"]
+
+_PATH = click.Path(path_type=Path)
+
+
+def _load(path: Path, kinds: tuple[type, ...]) -> Any:
+    from fibre.files import load
+
+    record = load(path)
+    if not isinstance(record, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise click.UsageError(f"{path} holds a {type(record).__name__}, not a {wanted}.")
+    return record
+
+
+@click.command("retrieve")
+@click.argument("record", type=_PATH)
+@click.argument("out", type=_PATH)
+@click.option("--iterations", type=int, default=150, show_default=True, help="Most Gerchberg-Saxton sweeps.")
+@click.option("--fibrelets", type=_PATH, help="Calibration fields whose fibrelets to use; needed for a recording.")
+@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+def retrieve_command(record: Path, out: Path, iterations: int, fibrelets: Path | None, overwrite: bool) -> None:
+    """Fields of every capture of RECORD (a Calibration or a Recording), written to OUT.
+
+    Example: polinfer retrieve sample.nc sample-fields.nc --fibrelets calibration-fields.nc
+    """
+    from fibre import Calibration, CalibrationFields, GerchbergSaxton, Recording, retrieve_fields, save
+
+    data = _load(record, (Calibration, Recording))
+    known = None if fibrelets is None else _load(fibrelets, (CalibrationFields,)).fibrelets
+    fields = retrieve_fields(data, GerchbergSaxton(iterations=iterations), fibrelets=known, progress=True)
+    click.echo(f"wrote {save(fields, out, overwrite=overwrite)}")
+    click.echo(f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field")
+
+
+@click.command("recover")
+@click.argument("fields", type=_PATH)
+@click.argument("out", type=_PATH)
+@click.option("--window", type=float, default=27.0, show_default=True, help="Side of the window, micrometres.")
+@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+def recover_command(fields: Path, out: Path, window: float, overwrite: bool) -> None:
+    """Inverse transmission matrix from the calibration FIELDS, written to OUT.
+
+    Example: polinfer recover calibration-fields.nc inverse.nc
+    """
+    from fibre import CalibrationFields, Ridge, recover, save
+
+    inverse = recover(_load(fields, (CalibrationFields,)), Ridge(window=window * 1e-6), progress=True)
+    click.echo(f"wrote {save(inverse, out, overwrite=overwrite)}")
+
+
+@click.command("reconstruct")
+@click.argument("inverse", type=_PATH)
+@click.argument("fields", type=_PATH)
+@click.argument("out", type=_PATH)
+@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+def reconstruct_command(inverse: Path, fields: Path, out: Path, overwrite: bool) -> None:
+    """Jones data at the distal facet from INVERSE and recorded FIELDS, written to OUT for `polinfer fit`.
+
+    Example: polinfer reconstruct inverse.nc sample-fields.nc measurement.nc
+    """
+    from fibre import Inverse, RecordingFields, reconstruct, save
+
+    measurement = reconstruct(_load(inverse, (Inverse,)), _load(fields, (RecordingFields,)))
+    click.echo(f"wrote {save(measurement, out, overwrite=overwrite)}: {measurement.shape} points, {measurement.states} states")
