@@ -163,7 +163,9 @@ def merge_exposures(frames: Any, exposures: Any, full_scale: int, rule: MergeRul
     times = real_array("exposures", exposures, shape=(len(frames),), above=0, finite=True)
     full_scale = integer("full_scale", full_scale, low=1)
     if frames.min() < 0 or frames.max() > full_scale:
-        raise ValueError(f"frames must hold counts from 0 to full_scale {full_scale}, got {frames.min()} to {frames.max()}.")
+        raise ValueError(
+            f"frames must hold counts from 0 to full_scale {full_scale}, got {frames.min()} to {frames.max()}."
+        )
     gain, dark = rule.conversion
     usable = frames < full_scale
     rates = frames * (gain / times)[:, None, None] - dark

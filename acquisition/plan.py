@@ -60,7 +60,7 @@ class Views:
 
     diversity: tuple[float, ...] = tuple(np.linspace(-120e-6, 120e-6, 7).tolist())
     steps: tuple[float, ...] = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
-    bracket: Bracket = Bracket(longest=64e-3, factor=2.0, stop=0.25e-3)
+    bracket: Bracket = field(default_factory=lambda: Bracket(longest=64e-3, factor=2.0, stop=0.25e-3))
 
     def __post_init__(self) -> None:
         for name in ("diversity", "steps"):
@@ -136,8 +136,7 @@ class CalibrationPlan(Plan):
     @cached_property
     def points(self) -> np.ndarray:
         """Distal points, (p, 2) metres, row by row, centred."""
-        rows, columns = self.grid
-        index = np.stack(np.mgrid[:rows, :columns], -1).reshape(-1, 2)
+        index = np.indices(self.grid).reshape(2, -1).T
         return (index - (np.array(self.grid) - 1) / 2) * self.pitch
 
     @cached_property

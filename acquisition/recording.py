@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +78,8 @@ class Folder:
         name = f"{identity}.npz"
         part = self.path / f".{name}.part"
         with open(part, "wb") as file:
-            np.savez(file, **{f"image_{i:03d}": frame for i, frame in enumerate(frames)})
+            named: dict[str, Any] = {f"image_{i:03d}": frame for i, frame in enumerate(frames)}
+            np.savez(file, **named)
             file.flush()
             os.fsync(file.fileno())
         digest = hashlib.sha256(part.read_bytes()).hexdigest()
@@ -114,8 +114,8 @@ class Folder:
 class MergedStack:
     """A (capture, image, y, x) array that merges raw exposures when a capture is asked for.
 
-    ``part`` picks radiance, variance or saturated. The last capture merged is remembered, since all three are asked
-    for in turn.
+    ``part`` is the field of :class:`acquisition.Merged` to show: radiance, variance or saturated. The last capture
+    merged is remembered in ``cache``, which the three stacks of a run share, since all are asked for in turn.
     """
 
     folder: Folder
@@ -123,13 +123,13 @@ class MergedStack:
     full_scale: int
     rule: MergeRule
     shape: tuple[int, int, int, int]
-    part: Callable[[Merged], np.ndarray]
+    part: str
     cache: dict[str, list[Merged]]
 
     @property
     def dtype(self) -> np.dtype:
         """float32, or bool for the saturation mask."""
-        return np.dtype(bool) if self.part is SATURATED else np.dtype(np.float32)
+        return np.dtype(bool if self.part == "saturated" else np.float32)
 
     def __len__(self) -> int:
         return len(self.identities)
@@ -138,30 +138,13 @@ class MergedStack:
         identity = self.identities[index]
         if identity not in self.cache:
             frames, exposures = self.folder.load(identity)
-            merged = [
-                merge_exposures(f, t, self.full_scale, self.rule) for f, t in zip(frames, exposures, strict=True)
-            ]
+            merged = [merge_exposures(f, t, self.full_scale, self.rule) for f, t in zip(frames, exposures, strict=True)]
             self.cache.clear()
             self.cache[identity] = merged
-        return np.stack([self.part(m) for m in self.cache[identity]]).astype(self.dtype)
+        return np.stack([getattr(m, self.part) for m in self.cache[identity]]).astype(self.dtype)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         if copy is False:
             raise ValueError("a lazy stack cannot be an array without a copy.")
         whole = np.stack([self[i] for i in range(len(self))])
         return whole if dtype is None else whole.astype(dtype)
-
-
-def RADIANCE(merged: Merged) -> np.ndarray:  # noqa: N802
-    """The radiance of a merged image."""
-    return merged.radiance
-
-
-def VARIANCE(merged: Merged) -> np.ndarray:  # noqa: N802
-    """The variance of a merged image."""
-    return merged.variance
-
-
-def SATURATED(merged: Merged) -> np.ndarray:  # noqa: N802
-    """The saturation mask of a merged image."""
-    return merged.saturated

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from acquisition.contracts import Bench
 from acquisition.plan import CalibrationPlan, Plan, SamplePlan, Step, Views
-from acquisition.recording import RADIANCE, SATURATED, VARIANCE, Folder, MergedStack
+from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
 from polinfer.checks import one_of_types
 
@@ -83,7 +83,7 @@ def _images(bench: Bench, views: Views, store: Folder, steps: list[Step]) -> Ima
     cache: dict = {}
     radiance, variance, saturated = (
         MergedStack(store, identities, bench.full_scale, bench.merge_rule, shape, part, cache)
-        for part in (RADIANCE, VARIANCE, SATURATED)
+        for part in ("radiance", "variance", "saturated")
     )
     return Images(
         radiance,

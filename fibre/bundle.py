@@ -165,8 +165,8 @@ class Bundle:
         distances = real_array("distances", distances, finite=True)
         oversampling, padding = integer("oversampling", oversampling, low=1), integer("padding", padding, low=1)
         step = real_number("pixel_size", pixel_size, above=0) / oversampling
-        inner = tuple(n * oversampling for n in shape)
-        outer = tuple(n * padding for n in inner)
+        inner = (shape[0] * oversampling, shape[1] * oversampling)
+        outer = (inner[0] * padding, inner[1] * padding)
         rows, columns = (self._profile(n, step, self.centres[:, axis]) for axis, n in enumerate(outer))
         crop = tuple(slice((o - i) // 2, (o - i) // 2 + i) for o, i in zip(outer, inner, strict=True))
         masks = transfer_function(outer, distances.ravel(), self.wavelength, step).astype(np.complex64)
@@ -187,7 +187,9 @@ class Bundle:
     def _profile(self, n: int, step: float, centres: np.ndarray) -> np.ndarray:
         u = (np.arange(n) - (n - 1) / 2) * step
         width = self.mode_radius
-        return (np.sqrt(np.sqrt(2 / np.pi) / width) * np.exp(-(((u[:, None] - centres) / width) ** 2))).astype(np.float32)
+        return (np.sqrt(np.sqrt(2 / np.pi) / width) * np.exp(-(((u[:, None] - centres) / width) ** 2))).astype(
+            np.float32
+        )
 
 
 def _couplings(

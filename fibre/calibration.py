@@ -58,9 +58,7 @@ class Profile:
 def _lit(fields: CalibrationFields) -> list[np.ndarray]:
     """Points lit in each capture."""
     inputs, count = fields.inputs.tocsc(), len(fields.points)
-    lit = [
-        np.unique(inputs.indices[inputs.indptr[c] : inputs.indptr[c + 1]] % count) for c in range(inputs.shape[1])
-    ]
+    lit = [np.unique(inputs.indices[inputs.indptr[c] : inputs.indptr[c + 1]] % count) for c in range(inputs.shape[1])]
     missing = sorted(set(range(count)) - {int(point) for points in lit for point in points})
     if missing:
         raise ValueError(f"inputs must light every point, but never light {len(missing)} of them, first {missing[0]}.")

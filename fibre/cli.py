@@ -39,7 +39,9 @@ def retrieve_command(record: Path, out: Path, iterations: int, fibrelets: Path |
     known = None if fibrelets is None else _load(fibrelets, (CalibrationFields,)).fibrelets
     fields = retrieve_fields(data, GerchbergSaxton(iterations=iterations), fibrelets=known, progress=True)
     click.echo(f"wrote {save(fields, out, overwrite=overwrite)}")
-    click.echo(f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field")
+    click.echo(
+        f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field"
+    )
 
 
 @click.command("recover")
@@ -71,4 +73,6 @@ def reconstruct_command(inverse: Path, fields: Path, out: Path, overwrite: bool)
     from fibre import Inverse, RecordingFields, reconstruct, save
 
     measurement = reconstruct(_load(inverse, (Inverse,)), _load(fields, (RecordingFields,)))
-    click.echo(f"wrote {save(measurement, out, overwrite=overwrite)}: {measurement.shape} points, {measurement.states} states")
+    click.echo(
+        f"wrote {save(measurement, out, overwrite=overwrite)}: {measurement.shape} points, {measurement.states} states"
+    )

@@ -105,7 +105,7 @@ def _peaks(image: np.ndarray) -> np.ndarray:
     tree = scipy.spatial.cKDTree(peaks)
     weaker = {j for i, j in (sorted(pair) for pair in tree.query_pairs(0.6 * pitch))}
     peaks = np.delete(peaks, sorted(weaker), axis=0)
-    offsets = np.stack(np.mgrid[-1:2, -1:2], -1).reshape(-1, 2)
+    offsets = np.indices((3, 3)).reshape(2, -1).T - 1
     around = smooth[peaks[:, None, 0] + offsets[:, 0], peaks[:, None, 1] + offsets[:, 1]]
     logs = np.log(np.maximum(around, 1e-3 * around.max(1, keepdims=True)))
     # quadratic in (row, column): a + b r + c s + d r^2 + e s^2 + f r s, least squares on nine points
@@ -128,7 +128,7 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     reach = int(np.ceil(3 * w / pixel_size))
     middle = (np.array(shape) - 1) / 2
     pixel = fibrelets.centres / pixel_size + middle
-    offset = np.stack(np.mgrid[-reach : reach + 1, -reach : reach + 1], -1).reshape(-1, 2)
+    offset = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach
     place = np.rint(pixel).astype(int)[:, None] + offset
     inside = ((place >= 0) & (place < np.array(shape))).all(-1)
     distance2 = ((place - pixel[:, None]) ** 2).sum(-1) * pixel_size**2

@@ -18,7 +18,7 @@ import scipy.sparse
 
 from fibre.propagation import transfer_function
 from polinfer.checks import complex_array, integer, one_of_types, real_array, real_number
-from polinfer.storage import array
+from polinfer.storage import array, setting
 
 __all__ = [
     "Calibration",
@@ -59,8 +59,8 @@ class Diversity:
 
     intensities: np.ndarray = array(("*P", "image", "y", "x"), "photo-electrons/s")
     masks: np.ndarray = array(("image", "y", "x"), "1")
-    wavelength: float
-    pixel_size: float
+    wavelength: float = setting()
+    pixel_size: float = setting()
     variance: np.ndarray | None = array(("*P", "image", "y", "x"), "(photo-electrons/s)^2", default=None)
 
     def __post_init__(self) -> None:
@@ -73,13 +73,13 @@ class Diversity:
         if self.variance is not None:
             variance = real_array("variance", self.variance, above=0)
             if variance.shape != intensities.shape:
-                raise ValueError(f"variance must have the shape of intensities {intensities.shape}, got {variance.shape}.")
+                raise ValueError(
+                    f"variance must have the shape of intensities {intensities.shape}, got {variance.shape}."
+                )
             object.__setattr__(self, "variance", variance)
 
 
-def Defocus(  # noqa: N802 - named like the record that it builds
-    intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None
-) -> Diversity:
+def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None) -> Diversity:
     """Diversity by defocus: image i (real (*B, m, y, x)) was taken ``distances[i]`` metres along the beam.
 
     >>> Defocus(np.ones((3, 8, 8)), [-1e-5, 0, 1e-5], wavelength=850e-9, pixel_size=1e-6).masks.shape
@@ -134,8 +134,8 @@ class Images:
     diversity: np.ndarray = array(("plane",), "m")
     steps: np.ndarray = array(("step",), "rad")
     times: np.ndarray = array(("capture",), "s")
-    wavelength: float
-    pixel_size: float
+    wavelength: float = setting()
+    pixel_size: float = setting()
 
     def __post_init__(self) -> None:
         diversity = real_array("diversity", self.diversity, shape=(None,), finite=True)
@@ -164,7 +164,8 @@ class Images:
     @property
     def frame(self) -> tuple[int, int]:
         """(y, x) of one image."""
-        return tuple(self.radiance.shape[-2:])
+        y, x = self.radiance.shape[-2:]
+        return int(y), int(x)
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class Calibration:
     images: Images = array((), "1")
     inputs: Any = array(("input", "capture"), "1")
     points: np.ndarray = array(("point", "row_column"), "m")
-    grid: tuple[int, int]
+    grid: tuple[int, int] = setting()
     references: Images = array((), "1")
     registration: np.ndarray = array(("row_column", "affine"), "1")
 
@@ -237,7 +238,7 @@ class Fibrelets:
     """
 
     centres: np.ndarray = array(("fibrelet", "row_column"), "m")
-    mode_radius: float
+    mode_radius: float = setting()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centres", real_array("centres", self.centres, shape=(None, 2), finite=True))
@@ -257,12 +258,12 @@ class CalibrationFields:
     fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
     reference: np.ndarray = array(("polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
-    inflation: float
-    relative_error: float
+    inflation: float = setting()
+    relative_error: float = setting()
     fibrelets: Fibrelets = array((), "1")
     inputs: Any = array(("input", "capture"), "1")
     points: np.ndarray = array(("point", "row_column"), "m")
-    grid: tuple[int, int]
+    grid: tuple[int, int] = setting()
     registration: np.ndarray = array(("row_column", "affine"), "1")
 
 
@@ -278,8 +279,8 @@ class RecordingFields:
     variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
     blank: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     blank_variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
-    inflation: float
-    relative_error: float
+    inflation: float = setting()
+    relative_error: float = setting()
     fibrelets: Fibrelets = array((), "1")
     illumination: np.ndarray = array(("polarisation", "state"), "1")
 
@@ -298,5 +299,5 @@ class Inverse:
     crosstalk_variance: Any = array(("output", "point"), "1")
     fibrelets: Fibrelets = array((), "1")
     points: np.ndarray = array(("point", "row_column"), "m")
-    grid: tuple[int, int]
-    ridge: float
+    grid: tuple[int, int] = setting()
+    ridge: float = setting()

@@ -1,5 +1,4 @@
 """Readers of published measurements."""
-# ruff: noqa: RUF009
 
 from __future__ import annotations
 

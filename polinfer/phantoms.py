@@ -1,6 +1,5 @@
 """Scenes with known truth: parameters, gain and labels of every pixel."""
 
-# ruff: noqa: RUF009
 from __future__ import annotations
 
 from dataclasses import dataclass

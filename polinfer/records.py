@@ -1,6 +1,5 @@
 """The records that the public verbs take and return."""
 
-# ruff: noqa: RUF009
 from __future__ import annotations
 
 import enum

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-__all__ = ["array", "from_dataset", "load", "save", "to_dataset"]
+__all__ = ["array", "from_dataset", "load", "save", "setting", "to_dataset"]
 
 FORMAT = 1
 CONVENTION = (
@@ -48,6 +48,11 @@ def array(dims: tuple[str, ...], units: str, **kwargs: Any) -> Any:
     'photo-electrons'
     """
     return dataclasses.field(metadata={"dims": dims, "units": units}, **kwargs)
+
+
+def setting(**kwargs: Any) -> Any:
+    """Declare a field that is stored as JSON: a number, a string, a tuple, or a frozen dataclass of such."""
+    return dataclasses.field(**kwargs)
 
 
 def _axis_names(dims: tuple[str, ...], ndim: int) -> list[str]:

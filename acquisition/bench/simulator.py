@@ -11,7 +11,7 @@ import numpy as np
 import scipy.ndimage
 
 from acquisition.bench.scene import Scene
-from acquisition.exposure import InverseVariance
+from acquisition.exposure import InverseVariance, MergeRule
 from acquisition.plan import Step, Views
 from polinfer import RetarderFirst
 from polinfer.checks import as_generator, one_of_types
@@ -34,7 +34,7 @@ class SimulatedBench:
         self.wavelength = scene.bundle.wavelength
         self.pixel_size = scene.camera.pixel_size
         self.full_scale = scene.camera.full_scale
-        self.merge_rule = InverseVariance(scene.camera.gain, scene.camera.read_noise)
+        self.merge_rule: MergeRule = InverseVariance(scene.camera.gain, scene.camera.read_noise)
         self.registration = np.array([[1.0, 0, 0], [0, 1.0, 0]])
         self._step: Step | None = None
         self._rates: np.ndarray | None = None
@@ -99,7 +99,9 @@ class SimulatedBench:
         index = [(np.arange(n * fine) + 0.5) / fine - 0.5 for n in (rows, columns)]
         grid = np.stack(np.meshgrid(*index, indexing="ij"))
         elements = [
-            scipy.ndimage.map_coordinates(jones[..., i, j], grid, order=3, mode="nearest") for i in (0, 1) for j in (0, 1)
+            scipy.ndimage.map_coordinates(jones[..., i, j], grid, order=3, mode="nearest")
+            for i in (0, 1)
+            for j in (0, 1)
         ]
         finer = np.stack(elements, -1).reshape(-1, 2, 2)
         middle = (np.array([rows, columns]) - 1) / 2

@@ -47,10 +47,10 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     worked on at a time; ``progress`` shows a bar.
 
     The variance of the field is the statistical floor: an amplitude :math:`\sqrt{I}` carries
-    :math:`\mathrm{var}(I)/4I`, the m planes are averaged, and the phase quadrature is taken to be as good as the
-    measured one; weights are inverse variances. It does not know of stagnation or of wrong distances; :func:`fibre.retrieve_fields` compares it with
-    the closure of the illumination states. MISFIT is raised where the mean squared amplitude misfit exceeds twice
-    what the image noise explains plus 1 % of the mean intensity.
+    :math:`\mathrm{var}(I)/4I`, the m planes are averaged with these as weights, and the phase quadrature is taken to
+    be as good as the measured one. It does not know of stagnation or of wrong distances;
+    :func:`fibre.retrieve_fields` compares it with the closure of the illumination states. MISFIT is raised where the
+    mean squared amplitude misfit exceeds twice what the image noise explains plus 1 % of the mean intensity.
 
     Raises
     ------
