@@ -6,6 +6,7 @@ the recovery methods.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ import scipy.spatial
 
 from fibre.records import CalibrationFields
 
-__all__ = ["Columns", "Profile", "columns", "coupling_profile"]
+__all__ = ["Columns", "Profile", "columns", "coupling_profile", "response_covariance"]
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,47 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     return Profile(np.array(middle), falling, float(max(-slope, 1 / furthest)))
 
 
+@dataclass(frozen=True)
+class _Regressions:
+    """The regression of some fibrelets on the inputs near them, padded to a common number q of points.
+
+    cores: (k,). chosen: (k, 2 q), indices of the inputs (h of the points, then v). prior: (k, 2 q), T, 0 where padded.
+    x: (k, 2 q, captures), the inputs. right: X^H T. systems: C for either polarisation of the output, (2, k, c, c).
+    """
+
+    cores: np.ndarray
+    chosen: np.ndarray
+    prior: np.ndarray
+    x: np.ndarray
+    right: np.ndarray
+    systems: np.ndarray
+
+
+def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iterator[_Regressions]:
+    count = len(fields.points)
+    positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
+    _lit(fields)
+    profile = coupling_profile(fields)
+    near = scipy.spatial.cKDTree(positions).query_ball_point(fields.fibrelets.centres, profile.reach(fraction))
+    inputs = np.vstack([fields.inputs.toarray(), np.zeros(fields.inputs.shape[1])])  # last row: no point at all
+    usable = [core for core in np.flatnonzero(clean) if near[core]]
+    if not usable:
+        raise ValueError("calibration_fields have no fibrelet within reach of a point; check the registration.")
+    for start in range(0, len(usable), chunk):
+        cores = np.array(usable[start : start + chunk])
+        points = np.full((len(cores), max(len(near[core]) for core in cores)), -1)
+        for i, core in enumerate(cores):
+            points[i, : len(near[core])] = near[core]
+        away = np.hypot(*np.moveaxis(positions[points] - fields.fibrelets.centres[cores][:, None], -1, 0))
+        prior = np.tile(np.where(points >= 0, profile(away), 0), 2)
+        chosen = np.where(prior > 0, np.concatenate([points, points + count], axis=1), 2 * count)
+        x = inputs[chosen]
+        right = x.conj().swapaxes(-1, -2) * prior[:, None]
+        noise = fields.variance[:, :, cores].transpose(1, 2, 0)
+        systems = right @ x + noise[..., None] * np.eye(noise.shape[-1])
+        yield _Regressions(cores, chosen, prior, x, right, systems)
+
+
 def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128) -> Columns:
     r"""Columns of A by linear regression with a local prior, one fibrelet at a time.
 
@@ -123,49 +165,50 @@ def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128)
     With the prior :math:`A_j \sim CN(0, \tau^2(d_j))` of the measured :func:`coupling_profile` and T = diag tau^2,
 
     .. math:: \hat A = y \, C^{-1} X^H T, \quad C = X^H T X + \mathrm{diag}(\mathrm{var}), \quad
-              \mathrm{var} \hat A = \mathrm{diag}(T - T X C^{-1} X^H T)
+              \Sigma = T - T X C^{-1} X^H T
 
     so spots that were lit together are told apart as well as the translations allow, and what stays ambiguous between
-    them is in the variance. Points beyond the distance at which the profile has fallen to ``fraction`` of its peak are
-    left out. Fibrelets that carry the reference spot get no columns. ``chunk`` fibrelets are worked on at a time.
+    them is in the covariance. Points beyond the distance at which the profile has fallen to ``fraction`` of its peak
+    are left out. Fibrelets that carry the reference spot get no columns. ``chunk`` fibrelets are worked on at a time.
     """
     count, cores = len(fields.points), len(fields.fibrelets.centres)
-    positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
-    _lit(fields)
-    profile = coupling_profile(fields)
-    near = scipy.spatial.cKDTree(positions).query_ball_point(fields.fibrelets.centres, profile.reach(fraction))
-    inputs = np.vstack([fields.inputs.toarray(), np.zeros(fields.inputs.shape[1])])  # last row: no point at all
-    cores_near = [core for core in np.flatnonzero(clean) if near[core]]
     rows, cols, values, variances = [], [], [], []
-    for start in range(0, len(cores_near), chunk):
-        part = np.array(cores_near[start : start + chunk])
-        width = max(len(near[core]) for core in part)
-        points = np.full((len(part), width), -1)
-        for i, core in enumerate(part):
-            points[i, : len(near[core])] = near[core]
-        away = np.hypot(*np.moveaxis(positions[points] - fields.fibrelets.centres[part][:, None], -1, 0))
-        prior = np.tile(np.where(points >= 0, profile(away), 0), 2)
-        chosen = np.concatenate([points, points + count], axis=1)
-        x = inputs[np.where(prior > 0, chosen, 2 * count)]  # (cores, 2 q, captures)
-        right = x.conj().swapaxes(-1, -2) * prior[:, None]
-        gram = right @ x
+    for part in _regressions(fields, fraction, chunk):
+        real = part.prior > 0
         for polarisation in range(2):
-            y, noise = fields.fields[:, polarisation, part].T, fields.variance[:, polarisation, part].T
-            solved = np.linalg.solve(gram + noise[:, None] * np.eye(noise.shape[1]), right)  # (cores, captures, 2 q)
-            found = np.einsum("kc,kcj->kj", y, solved)
-            left = prior - np.einsum("kj,kjc,kcj->kj", prior, x, solved).real
-            real = prior > 0
-            rows.append(np.broadcast_to(polarisation * cores + part[:, None], real.shape)[real])
-            cols.append(chosen[real])
+            solved = np.linalg.solve(part.systems[polarisation], part.right)  # (k, captures, 2 q)
+            found = np.einsum("ck,kcj->kj", fields.fields[:, polarisation, part.cores], solved)
+            left = part.prior - np.einsum("kj,kjc,kcj->kj", part.prior, part.x, solved).real
+            rows.append(np.broadcast_to(polarisation * cores + part.cores[:, None], real.shape)[real])
+            cols.append(part.chosen[real])
             values.append(found[real])
-            variances.append(left[real])
-    if not rows:
-        raise ValueError("calibration_fields have no fibrelet within reach of a point; check the registration.")
+            variances.append(np.maximum(left[real], 0))
     place = (np.concatenate(rows), np.concatenate(cols))
     shape = (2 * cores, 2 * count)
-    spread = np.maximum(np.concatenate(variances), 0)
     return Columns(
         scipy.sparse.csr_array((np.concatenate(values), place), shape=shape),
-        scipy.sparse.csr_array((spread, place), shape=shape),
-        positions,
+        scipy.sparse.csr_array((np.concatenate(variances), place), shape=shape),
+        positions_on_camera(fields),
     )
+
+
+def response_covariance(
+    fields: CalibrationFields, inputs: np.ndarray, fraction: float = 1e-5, chunk: int = 128
+) -> np.ndarray:
+    r"""How uncertain the calibration leaves each fibrelet's response to given distal fields.
+
+    For fields Z (2 p, s) and the error :math:`\delta A` of a row of A, :math:`E[(\delta A Z)^H \delta A Z] = Z^H \Sigma
+    Z` with the covariance of :func:`columns`: complex (2 m, s, s), rows h of all fibrelets then v, 0 where there are
+    no columns. Errors of different rows are independent.
+    """
+    inputs = np.vstack([inputs, np.zeros(inputs.shape[1])])
+    cores = len(fields.fibrelets.centres)
+    covariance = np.zeros((2 * cores, inputs.shape[1], inputs.shape[1]), complex)
+    for part in _regressions(fields, fraction, chunk):
+        z = inputs[part.chosen]
+        bent = part.right @ z  # X^H T Z
+        for polarisation in range(2):
+            explained = bent.conj().swapaxes(-1, -2) @ np.linalg.solve(part.systems[polarisation], bent)
+            before = (z.conj().swapaxes(-1, -2) * part.prior[:, None]) @ z
+            covariance[polarisation * cores + part.cores] = before - explained
+    return covariance

@@ -7,7 +7,9 @@ distal points, with a noise estimate a pixel. Called by users and by the ``recon
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse
 
+from fibre.calibration import columns, response_covariance
 from fibre.records import Inverse, RecordingFields
 from polinfer import Measurement
 from polinfer.checks import one_of_types
@@ -19,17 +21,20 @@ def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurem
     r"""Fields at the distal facet, V with the sample and U without, as a measurement of Jones matrices.
 
     :math:`\hat V = A^{-1} y`, :math:`\hat U = A^{-1} y_{blank}` at every point and state; the illumination is the
-    measured :math:`\hat U`, so that what the inverse gets wrong in amplitude and phase cancels. One sigma a pixel
-    (per complex component of V) collects, with J estimated by :math:`\hat V \hat U^+` for this purpose only,
+    measured :math:`\hat U`, so that what the inverse gets wrong in amplitude and phase cancels.
 
-    .. math:: \sigma^2 = \overline{\mathrm{var} V} + \tfrac12 \|J\|^2 \, \overline{\mathrm{var} U}
-              + \tfrac n2 \, (\|J\|^2 - \tfrac12 |\mathrm{tr} J|^2) \sum_{j} X_{j} |u_{j}|^2
+    One sigma a pixel (per complex component of V) collects three errors. With :math:`J = \hat V \hat U^+` (for this
+    purpose only), the rows a of A^-1 of a point and :math:`b = J a`, the error of state s in polarisation p is
 
-    The first two are the noise of the recordings, averaged over the polarisations and the n states: the H and V
-    variances differ, and one sigma cannot say so. The third is the noise X of the calibration itself. It multiplies V
-    and U alike, so what commutes with J cancels (for E with independent entries of variance v,
-    :math:`E\|EJ - JE\|^2 = v (4\|J\|^2 - 2|\mathrm{tr} J|^2)`); it is the same for all states, so it does not average
-    down over them, hence n/2. J is taken to be smooth over the range of crosstalk.
+    .. math:: e_{ps} = \sum_k a_{pk} (n_{ks} - \delta A_k V_s) - b_{pk} (m_{ks} - \delta A_k U_s)
+
+    n and m being the noise of the recording with and without the sample, and :math:`\delta A_k` the error of the
+    calibration, which enters both, for all states, and over the neighbourhood; its covariance is
+    :func:`fibre.calibration.response_covariance`. Those errors are correlated over the states, so what counts is what
+    they do to J, :math:`\sigma^2 = \tfrac14 \sum_p \sum_{st} E[e_{ps} e_{pt}^*] (U^+ U)_{st}`: the sigma of
+    independent errors that would give J the same mean square error. H and V differ in noise, and so do the states;
+    one sigma does not say so. To this is added, in the same way, what the regularisation mixes in from neighbours that
+    differ, estimated by sending the estimates through :math:`A^{-1} \hat A` once more.
 
     Raises
     ------
@@ -37,26 +42,16 @@ def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurem
     """
     one_of_types("inverse", inverse, (Inverse,), "make it with recover().")
     one_of_types("recording_fields", recording_fields, (RecordingFields,), "make them with retrieve_fields(recording).")
-    if not np.array_equal(inverse.fibrelets.centres, recording_fields.fibrelets.centres):
+    calibration = inverse.calibration
+    if not np.array_equal(calibration.fibrelets.centres, recording_fields.fibrelets.centres):
         raise ValueError(
             "recording_fields must be in the fibrelets of the inverse; pass fibrelets=calibration_fields.fibrelets to "
             "retrieve_fields."
         )
-    response, response_variance = _image(inverse, recording_fields.fields, recording_fields.variance)
-    illumination, illumination_variance = _image(inverse, recording_fields.blank, recording_fields.blank_variance)
-    jones = response @ np.linalg.pinv(illumination)
-    power = (np.abs(jones) ** 2).sum((-2, -1))
-    trace = np.abs(np.trace(jones, axis1=-2, axis2=-1)) ** 2
-    count, states = len(inverse.points), response.shape[-1]
-    light = (np.abs(illumination) ** 2).sum(1).mean(-1)
-    leak = inverse.crosstalk_variance @ light
-    crosstalk = (leak[:count] + leak[count:]) / 2
-    variance = (
-        response_variance.mean((1, 2))
-        + power / 2 * illumination_variance.mean((1, 2))
-        + states / 2 * np.maximum(power - trace / 2, 0) * crosstalk
-    )
-    rows, columns = inverse.grid
+    states = recording_fields.fields.shape[0]
+    response, illumination = (_image(inverse, fields) for fields in (recording_fields.fields, recording_fields.blank))
+    variance = _variance(inverse, recording_fields, response, illumination)
+    rows, columns = calibration.grid
     return Measurement(
         illumination.reshape(rows, columns, 2, states),
         response.reshape(rows, columns, 2, states),
@@ -64,9 +59,36 @@ def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurem
     )
 
 
-def _image(inverse: Inverse, fields: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fields (p, 2, n) at the points and their variances, from mode amplitudes (n, 2, m)."""
-    states, count = len(fields), len(inverse.points)
+def _image(inverse: Inverse, fields: np.ndarray) -> np.ndarray:
+    """Fields (p, 2, n) at the points from mode amplitudes (n, 2, m)."""
+    states, count = len(fields), len(inverse.calibration.points)
     values = inverse.matrix @ fields.reshape(states, -1).T
-    spread = abs(inverse.matrix).power(2) @ variance.reshape(states, -1).T
-    return values.reshape(2, count, states).swapaxes(0, 1), spread.reshape(2, count, states).swapaxes(0, 1)
+    return values.reshape(2, count, states).swapaxes(0, 1)
+
+
+def _variance(inverse: Inverse, fields: RecordingFields, response: np.ndarray, illumination: np.ndarray) -> np.ndarray:
+    """sigma^2 of every point, (p,), by the formula of :func:`reconstruct`."""
+    count, _, states = response.shape
+    pseudo = np.linalg.pinv(illumination)
+    jones, projector = response @ pseudo, pseudo @ illumination  # (p, 2, 2), (p, n, n)
+    distal = np.concatenate([x.swapaxes(0, 1).reshape(2 * count, states) for x in (response, illumination)], axis=1)
+    shared = response_covariance(inverse.calibration, distal)  # (2 m, 2 n, 2 n)
+    own = np.concatenate([x.reshape(states, -1).T for x in (fields.variance, fields.blank_variance)], axis=1)
+    covariance = shared + own[:, :, None] * np.eye(2 * states)
+    parts = inverse.matrix[:count], inverse.matrix[count:]
+    total = np.zeros(count)
+    for p in range(2):
+        a = parts[p]
+        b = sum(scipy.sparse.diags_array(jones[:, p, q]) @ parts[q] for q in range(2))
+        pairs = ((a, a, 0, 0, 1), (b, b, 1, 1, 1), (a, b, 0, 1, -1), (b, a, 1, 0, -1))
+        for left, right, i, j, sign in pairs:
+            block = covariance[:, i * states : (i + 1) * states, j * states : (j + 1) * states]
+            errors = left.conj().multiply(right).tocsr() @ block.reshape(len(block), -1)
+            # e P e^H = sum of P_ts E[e_s^* e_t]
+            total += sign * np.einsum("ist,its->i", errors.reshape(count, states, states), projector).real
+    # what the regularisation mixes in from neighbours that differ, seen by sending the estimates through it once more
+    known = columns(inverse.calibration).values
+    again = (inverse.matrix @ (known @ distal)).reshape(2, count, 2 * states).swapaxes(0, 1)
+    blur = again[..., :states] - jones @ again[..., states:]
+    total += np.einsum("ips,ist,ipt->i", blur, projector, blur.conj()).real
+    return np.maximum(total, 0) / 4

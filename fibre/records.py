@@ -287,17 +287,13 @@ class RecordingFields:
 
 @dataclass(frozen=True)
 class Inverse:
-    """The inverse transmission matrix A^-1, and how well the calibration knows it.
+    """The inverse transmission matrix A^-1, with the calibration that it was made from.
 
     matrix: sparse complex (2 p, 2 m): field at the distal points (h of all p, then v) from mode amplitudes (h of all
-    m, then v). crosstalk_variance: sparse real (2 p, p): E|error|^2 of the amplitude that leaks to a row from unit
-    amplitude in either polarisation at each point, because the calibration fields are noisy. points, grid: as in
-    :class:`Calibration`. ridge: the regularisation used, in units of the mean diagonal of Y Y^H.
+    m, then v). ridge: the regularisation used, in units of the mean power of a fibrelet in the columns of A.
+    calibration: the fields, which say how well A is known.
     """
 
     matrix: Any = array(("output", "mode"), "1/sqrt(photo-electrons/s)")
-    crosstalk_variance: Any = array(("output", "point"), "1")
-    fibrelets: Fibrelets = array((), "1")
-    points: np.ndarray = array(("point", "row_column"), "m")
-    grid: tuple[int, int] = setting()
     ridge: float = setting()
+    calibration: CalibrationFields = array((), "1")

@@ -19,7 +19,7 @@ class RecoveryMethod(ABC):
 
     @abstractmethod
     def solve(self, fields: CalibrationFields, progress: bool) -> Inverse:
-        """The inverse transmission matrix and its calibration noise."""
+        """The inverse transmission matrix."""
 
 
 def recover(calibration_fields: CalibrationFields, method: RecoveryMethod, progress: bool = False) -> Inverse:

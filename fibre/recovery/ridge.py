@@ -73,15 +73,5 @@ class Ridge(RecoveryMethod):
             data.append(row.ravel())
         place = (np.concatenate(rows), np.concatenate(cols))
         matrix = scipy.sparse.csr_array((np.concatenate(data), place), shape=(2 * count, 2 * cores))
-        power = abs(matrix).power(2)
-        both = power @ variance
-        crosstalk = (both[:, :count] + both[:, count:]) / 2
         scale = float((abs(values).power(2)).sum() / observed.sum())
-        return Inverse(
-            matrix,
-            scipy.sparse.csr_array(crosstalk),
-            fields.fibrelets,
-            fields.points,
-            fields.grid,
-            float(ridge[observed].mean() / scale),
-        )
+        return Inverse(matrix, float(ridge[observed].mean() / scale), fields)
