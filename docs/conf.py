@@ -8,7 +8,7 @@ from typing import Any
 
 project = "polinfer"
 author = "The polinfer developers"
-copyright = author  # noqa: A001 - the name that Sphinx reads
+copyright = author
 version = release = metadata.version("polinfer")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
