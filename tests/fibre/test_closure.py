@@ -1,0 +1,77 @@
+"""The closure of the states sees noise, all of it and nothing else."""
+
+import numpy as np
+import pytest
+
+from fibre.closure import NoiseScale, closure_errors, noise_scale
+
+
+def states(n, seed=0):
+    generator = np.random.default_rng(seed)
+    return generator.normal(size=(2, n)) + 1j * generator.normal(size=(2, n))
+
+
+def linear_fields(u, count, seed=1):
+    """(n, count) fields that depend linearly on the states, of widely different strength."""
+    generator = np.random.default_rng(seed)
+    response = generator.normal(size=(2, count)) + 1j * generator.normal(size=(2, count))
+    return np.einsum("an,ac->nc", u, response * 10 ** generator.uniform(-2, 1, count))
+
+
+def complex_noise(generator, shape):
+    return (generator.normal(size=shape) + 1j * generator.normal(size=shape)) / np.sqrt(2)
+
+
+@pytest.mark.parametrize("n", [3, 4, 6])
+def test_fields_linear_in_the_states_close_exactly(n):
+    u = states(n)
+    squared, stated, power = closure_errors(linear_fields(u, 50), np.ones((n, 50)), u)
+    assert squared.shape == (n - 2, 50)
+    assert np.all(squared < 1e-24 * power.max())
+    np.testing.assert_allclose(stated, 1)  # coefficients of unit length
+
+
+def test_a_field_that_is_not_linear_in_the_states_does_not_close():
+    u = states(3)
+    fields = linear_fields(u, 50)
+    fields[1] *= np.exp(0.1j)
+    squared, _, power = closure_errors(fields, np.ones((3, 50)), u)
+    assert np.median(squared / power) > 1e-4
+
+
+@pytest.mark.parametrize(("inflation", "relative"), [(1.0, 0.0), (2.5, 0.0), (1.0, 0.03), (3.0, 0.05)])
+def test_the_noise_scale_is_found_within_its_own_error(inflation, relative):
+    u, count = states(4), 4000
+    generator = np.random.default_rng(5)
+    clean = linear_fields(u, count)
+    stated = generator.uniform(1e-4, 1e-3, clean.shape)
+    true = inflation * stated + relative**2 * np.abs(clean) ** 2
+    found = []
+    for _ in range(8):
+        noisy = clean + np.sqrt(true) * complex_noise(generator, clean.shape)
+        scale = noise_scale(closure_errors(noisy, stated, u))
+        found.append((scale.inflation, scale.relative_error))
+    mean, error = np.mean(found, 0), np.std(found, 0, ddof=1) / np.sqrt(8)
+    # neither can be negative: at the bound the estimate is a little above it
+    assert abs(mean[0] - inflation) < 4 * error[0] + 0.02
+    assert abs(mean[1] - relative) < 4 * error[1] + 2e-3
+
+
+def test_two_states_change_nothing():
+    u = states(2)
+    errors = closure_errors(linear_fields(u, 30), np.ones((2, 30)), u)
+    assert errors.shape == (3, 0, 30)
+    assert noise_scale(errors.reshape(3, -1)) == NoiseScale(1.0, 0.0)
+
+
+def test_quiet_data_never_lower_the_stated_variance():
+    u = states(3)
+    fields = linear_fields(u, 200)
+    scale = noise_scale(closure_errors(fields, np.ones((3, 200)), u))
+    assert (scale.inflation, scale.relative_error) == (1.0, 0.0)
+    np.testing.assert_array_equal(scale.variance(fields, np.ones((3, 200))), np.ones((3, 200)))
+
+
+def test_the_variance_is_inflation_times_stated_plus_relative_error_squared_times_power():
+    found = NoiseScale(2.0, 0.1).variance(np.array([3j, 0]), np.array([0.5, 0.25]))
+    np.testing.assert_allclose(found, [1 + 0.09, 0.5])

@@ -1,0 +1,127 @@
+"""Fibrelets are found where they are, and fields are expressed in their modes with a true variance."""
+
+import numpy as np
+import pytest
+import scipy.spatial
+
+from fibre import Bundle, Fibrelets, find_fibrelets
+from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
+
+PIXEL, SHAPE = 0.5e-6, (140, 150)
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    return Bundle.hexagonal(radius=30e-6, rng=2)
+
+
+@pytest.fixture(scope="module")
+def image(bundle):
+    """An incoherent sum of many random fields, with photon noise: 500 photo-electrons at a typical peak."""
+    generator = np.random.default_rng(0)
+    parts = generator.normal(size=(2, 30, 2, bundle.cores))
+    total = (np.abs(bundle.image(parts[0] + 1j * parts[1], SHAPE, PIXEL)) ** 2).sum((0, 1)).astype(float)
+    return generator.poisson(total * 500 / np.quantile(total, 0.95)).astype(float)
+
+
+def pixels(bundle):
+    return bundle.centres / PIXEL + (np.array(SHAPE) - 1) / 2
+
+
+def test_every_fibrelet_is_found_once_and_nothing_else(bundle, image):
+    found = find_fibrelets(image)
+    distance, _ = scipy.spatial.cKDTree(found).query(pixels(bundle))
+    assert np.mean(distance < 1.5) >= 0.99  # recall
+    distance, nearest = scipy.spatial.cKDTree(pixels(bundle)).query(found)
+    assert np.mean(distance < 1.5) >= 0.99  # precision
+    assert len(np.unique(nearest)) == len(nearest)
+    assert np.sqrt(np.mean(distance[distance < 1.5] ** 2)) < 0.2
+
+
+def test_centres_of_separate_spots_are_sub_pixel_for_any_offset():
+    y, x = np.mgrid[:90, :90]
+    generator = np.random.default_rng(1)
+    centres = np.array([(10 + 9 * r, 10 + 10 * c + 5 * (r % 2)) for r in range(8) for c in range(7)], float)
+    centres += generator.uniform(-0.5, 0.5, centres.shape)
+    image = sum(np.exp(-((y - r) ** 2 + (x - c) ** 2) / 6) for r, c in centres)
+    found = find_fibrelets(image)
+    assert len(found) == len(centres)
+    distance, _ = scipy.spatial.cKDTree(centres).query(found)
+    assert distance.max() < 0.05
+
+
+def test_the_mode_radius_and_the_positions_in_metres_are_the_bundles(bundle, image):
+    found = locate_fibrelets(image, PIXEL)
+    assert found.mode_radius == pytest.approx(bundle.mode_radius.mean(), rel=0.02)
+    distance, _ = scipy.spatial.cKDTree(bundle.centres).query(found.centres)
+    assert np.median(distance) < 0.1e-6
+
+
+def test_a_dark_or_flat_image_shows_no_lattice():
+    with pytest.raises(ValueError, match="image shows no lattice"):
+        find_fibrelets(np.ones((64, 64)))
+    with pytest.raises(ValueError, match="image must have shape"):
+        find_fibrelets(np.ones(64))
+    with pytest.raises(ValueError, match="image must be finite"):
+        find_fibrelets(np.full((64, 64), np.inf))
+
+
+def test_modes_have_unit_power_and_overlap_as_gaussians_do(bundle):
+    w = 1.6e-6
+    modes = mode_matrix(Fibrelets(bundle.centres, w), SHAPE, PIXEL)
+    gram = (modes.T @ modes).toarray()
+    np.testing.assert_allclose(gram.diagonal(), 1, rtol=1e-5)
+    distance2 = ((bundle.centres[:, None] - bundle.centres) ** 2).sum(-1)
+    np.testing.assert_allclose(gram, np.exp(-distance2 / (2 * w**2)), atol=2e-4)
+
+
+def test_modes_are_those_of_the_bundles_image(bundle):
+    same = Bundle(bundle.centres, np.full(bundle.cores, 1.6e-6), bundle.transfer)
+    c = np.random.default_rng(1).normal(size=(2, bundle.cores)) + 0j
+    seen = same.image(c, SHAPE, PIXEL)[1] * PIXEL
+    made = (mode_matrix(Fibrelets(same.centres, 1.6e-6), SHAPE, PIXEL) @ c[1]).reshape(SHAPE)
+    assert np.linalg.norm(seen - made) < 1e-3 * np.linalg.norm(made)
+
+
+def small():
+    centres = np.array([[0, 0], [4.4, 0.3], [0.2, 4.6], [-4.1, 2.2], [2.3, -4.5]]) * 1e-6
+    return mode_matrix(Fibrelets(centres, 1.6e-6), (30, 32), PIXEL)
+
+
+def test_amplitudes_are_dense_weighted_least_squares():
+    modes, generator = small(), np.random.default_rng(3)
+    field = generator.normal(size=(30, 32)) + 1j * generator.normal(size=(30, 32))
+    variance = generator.uniform(0.5, 2, (30, 32))
+    variance[10:14, 12:20] = np.inf
+    field[11, 13] = np.nan  # where it says nothing it may be anything
+    prior = 3.0
+    found, stated = mode_amplitudes(field, variance, modes, prior)
+    g = modes.toarray()
+    usable = np.isfinite(variance.ravel())
+    weight = 1 / variance.ravel()[usable]
+    rows = np.vstack([g[usable] * np.sqrt(weight)[:, None], np.eye(5) / np.sqrt(prior)])
+    right = np.concatenate([field.ravel()[usable] * np.sqrt(weight), np.zeros(5)])
+    np.testing.assert_allclose(found, np.linalg.lstsq(rows + 0j, right, rcond=None)[0], rtol=1e-9)
+    np.testing.assert_allclose(stated, np.diag(np.linalg.inv(rows.T @ rows)), rtol=0.01)
+
+
+def test_the_stated_variance_is_the_mean_squared_error():
+    modes, generator = small(), np.random.default_rng(4)
+    truth = generator.normal(size=5) + 1j * generator.normal(size=5)
+    clean = (modes @ truth).reshape(30, 32)
+    variance = generator.uniform(0.01, 0.05, (30, 32))
+    errors = []
+    for _ in range(600):
+        noise = generator.normal(size=(2, 30, 32)) * np.sqrt(variance / 2)
+        found, stated = mode_amplitudes(clean + noise[0] + 1j * noise[1], variance, modes, 1e6)
+        errors.append(np.abs(found - truth) ** 2 / stated)
+    # exponential variables: standard deviation 1 each
+    assert np.mean(errors) == pytest.approx(1, abs=4 / np.sqrt(600 * 5) + 0.01)
+    assert np.std(errors) == pytest.approx(1, rel=0.1)
+
+
+def test_without_light_the_prior_is_all_there_is():
+    modes = small()
+    found, stated = mode_amplitudes(np.ones((30, 32)), np.full((30, 32), np.inf), modes, 2.5)
+    assert np.all(found == 0)
+    np.testing.assert_allclose(stated, 2.5)
