@@ -230,25 +230,38 @@ def save(record: Any, path: str | Path, overwrite: bool = False) -> Path:
 
     Raises
     ------
-    FileExistsError: ``path`` exists and ``overwrite`` is False. ValueError: unknown ending. TypeError: no record.
+    FileExistsError: ``path`` exists and ``overwrite`` is False. FileNotFoundError: its folder does not exist.
+    ValueError: unknown ending. TypeError: no record.
     """
     path = Path(path)
     kind = _kind(path)
     if path.exists() and not overwrite:
         raise FileExistsError(f"path {path} exists; choose another name or pass overwrite=True.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"path {path} is in a folder that does not exist; make {path.parent} first.")
     dataset = to_dataset(record)
     part = path.with_name(f".{path.name}.part")
-    if kind == ".nc":
-        encoding = {name: {"_FillValue": None} for name in dataset.variables}
-        dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding)
-    else:
-        if part.exists():
-            shutil.rmtree(part)
-        dataset.to_zarr(part, mode="w", consolidated=False)
+    _remove(part)
+    try:
+        if kind == ".nc":
+            encoding = {name: {"_FillValue": None} for name in dataset.variables}
+            dataset.to_netcdf(part, engine="h5netcdf", encoding=encoding)
+        else:
+            dataset.to_zarr(part, mode="w", consolidated=False)
+    except BaseException:
+        _remove(part)
+        raise
     if path.is_dir():
-        shutil.rmtree(path)
+        _remove(path)
     os.replace(part, path)
     return path
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def load(path: str | Path, classes: Iterable[type]) -> Any:
