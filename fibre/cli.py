@@ -33,12 +33,18 @@ def retrieve_command(record: Path, out: Path, iterations: int, fibrelets: Path |
 
     Example: polinfer retrieve sample.nc sample-fields.nc --fibrelets calibration-fields.nc
     """
-    from fibre import Calibration, CalibrationFields, GerchbergSaxton, Recording, retrieve_fields, save
+    import numpy as np
+
+    from fibre import Calibration, CalibrationFields, GerchbergSaxton, Recording, RecordingFields, retrieve_fields, save
 
     data = _load(record, (Calibration, Recording))
     known = None if fibrelets is None else _load(fibrelets, (CalibrationFields,)).fibrelets
     fields = retrieve_fields(data, GerchbergSaxton(iterations=iterations), fibrelets=known, progress=True)
     click.echo(f"wrote {save(fields, out, overwrite=overwrite)}")
+    parts = [fields.status] + ([fields.blank_status] if isinstance(fields, RecordingFields) else [])
+    status = np.concatenate(parts)
+    if status.any():
+        click.echo(f"{np.count_nonzero(status)} of {len(status)} captures did not converge or misfit their images")
     click.echo(
         f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field"
     )

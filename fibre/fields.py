@@ -33,15 +33,18 @@ __all__ = ["retrieve_fields"]
 
 @dataclass(frozen=True)
 class _Amplitudes:
-    """Mode amplitudes of some captures, complex (captures, 2, m), and the variance that the image noise explains."""
+    """Mode amplitudes of some captures, complex (captures, 2, m), the variance that the image noise explains, and the
+    retrieval's status (captures,)."""
 
     values: np.ndarray
     variance: np.ndarray
+    status: np.ndarray
 
     def in_phase_with(self, reference: np.ndarray) -> _Amplitudes:
         """Turn every capture so that the reference spot has the phase it has alone."""
         overlap = np.einsum("pk,cpk->c", np.conj(reference) * _reference_region(reference), self.values)
-        return _Amplitudes(self.values * np.exp(-1j * np.angle(overlap))[:, None, None], self.variance)
+        turned = self.values * np.exp(-1j * np.angle(overlap))[:, None, None]
+        return _Amplitudes(turned, self.variance, self.status)
 
 
 def _reference_region(reference: np.ndarray) -> np.ndarray:
@@ -104,6 +107,7 @@ def retrieve_fields(
             record.points,
             record.grid,
             record.registration,
+            fields.status,
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
@@ -123,6 +127,8 @@ def retrieve_fields(
         noise.relative_error,
         fibrelets,
         record.illumination,
+        fields.status,
+        blank.status,
     )
 
 
@@ -142,6 +148,7 @@ def _retrieve(
     modes = mode_matrix(fibrelets, images.frame, images.pixel_size)
     values = np.empty((images.captures, 2, len(fibrelets.centres)), complex)
     variance = np.empty(values.shape)
+    status = np.zeros(images.captures, np.uint8)
     bar = tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not progress)
     for start in range(0, images.captures, batch):
         part = range(start, min(start + batch, images.captures))
@@ -153,6 +160,7 @@ def _retrieve(
             radiance[:, :planes], images.diversity, images.wavelength, images.pixel_size, noise[:, :planes]
         )
         retrieved = retrieve(diversity, method, batch=batch)
+        status[part.start : part.stop] = retrieved.status
         fringes = relative_phase(radiance[:, planes:], images.steps, 1 / noise[:, planes:])
         for i, capture in enumerate(part):
             h, h_variance = retrieved.field[i].astype(complex), retrieved.variance[i].astype(float)
@@ -169,7 +177,7 @@ def _retrieve(
             variance[capture, 1] += ratio * variance[capture, 0]
             bar.update()
     bar.close()
-    return _Amplitudes(values, variance)
+    return _Amplitudes(values, variance, status)
 
 
 def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -193,6 +201,6 @@ def _calibration_noise(fields: _Amplitudes, calibration: Calibration, reference:
     for points, captures in groups.items():
         states = inputs[[points[0], points[0] + count], :][:, captures].toarray()
         chosen = np.array(captures)
-        part = _Amplitudes(fields.values[chosen], fields.variance[chosen])
+        part = _Amplitudes(fields.values[chosen], fields.variance[chosen], fields.status[chosen])
         errors.append(_closure(part, reference, states))
     return noise_scale(np.concatenate(errors, axis=1))

@@ -252,7 +252,8 @@ class CalibrationFields:
     fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape,
     E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation,
     relative_error: what the closure of the illumination states found beyond the image noise (1 and 0 = nothing);
-    ``variance`` contains both. inputs, points, grid, registration: as in :class:`Calibration`.
+    ``variance`` contains both. inputs, points, grid, registration: as in :class:`Calibration`. status:
+    :class:`RetrievalStatus` of every capture (captures,), None where no retrieval was made.
     """
 
     fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -265,6 +266,7 @@ class CalibrationFields:
     points: np.ndarray = array(("point", "row_column"), "m")
     grid: tuple[int, int] = setting()
     registration: np.ndarray = array(("row_column", "affine"), "1")
+    status: np.ndarray | None = array(("capture",), "1", default=None)
 
 
 @dataclass(frozen=True)
@@ -272,7 +274,8 @@ class RecordingFields:
     """Mode amplitudes of a recording: n states with the sample and n without, in the calibration's fibrelets.
 
     fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real, E|error|^2,
-    ``inflation`` and ``relative_error`` contained. illumination: complex (2, n), nominal.
+    ``inflation`` and ``relative_error`` contained. illumination: complex (2, n), nominal. status, blank_status:
+    :class:`RetrievalStatus` (n,), or None.
     """
 
     fields: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -283,6 +286,8 @@ class RecordingFields:
     relative_error: float = setting()
     fibrelets: Fibrelets = array((), "1")
     illumination: np.ndarray = array(("polarisation", "state"), "1")
+    status: np.ndarray | None = array(("state",), "1", default=None)
+    blank_status: np.ndarray | None = array(("state",), "1", default=None)
 
 
 @dataclass(frozen=True)
