@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 project = "polinfer"
@@ -15,7 +17,8 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 exclude_patterns = ["figures"]
-html_theme = "furo"
+html_theme = "alabaster"
+html_theme_options = {"page_width": "1100px", "description": "Bayesian polarimetry and fibre imaging"}
 html_title = f"polinfer {release}"
 html_show_sphinx = False
 
@@ -68,5 +71,17 @@ def plain_docstring(app: Any, what: str, name: str, obj: Any, options: Any, line
     lines[:] = out
 
 
+def missing_names(app: Any) -> None:  # noqa: ARG001
+    """Every public name stands in api.md; one that does not is a warning, hence an error of the build."""
+    from sphinx.util import logging
+
+    listed = Path(__file__).with_name("api.md").read_text()
+    for package in ("polinfer", "fibre", "acquisition"):
+        for name in importlib.import_module(package).__all__:
+            if f"`{package}.{name}`" not in listed and f".. automodule:: {package}.{name}" not in listed:
+                logging.getLogger(__name__).warning("api.md does not list %s.%s", package, name)
+
+
 def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", plain_docstring)
+    app.connect("builder-inited", missing_names)
