@@ -32,9 +32,10 @@ class Bracket:
     stop: float = 1e-4
 
     def __post_init__(self) -> None:
-        real_number("longest", self.longest, above=0)
-        real_number("factor", self.factor, above=1)
-        real_number("stop", self.stop, above=0, high=self.longest)
+        # kept as plain floats: a plan's hash must not depend on which kind of number it was given
+        object.__setattr__(self, "longest", real_number("longest", self.longest, above=0))
+        object.__setattr__(self, "factor", real_number("factor", self.factor, above=1))
+        object.__setattr__(self, "stop", real_number("stop", self.stop, above=0, high=self.longest))
 
     def times(self) -> Any:
         """All exposure times, seconds, longest first."""

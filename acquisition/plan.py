@@ -127,10 +127,10 @@ class CalibrationPlan(Plan):
     def __post_init__(self) -> None:
         rows, columns = self.grid
         object.__setattr__(self, "grid", (integer("grid", rows, low=1), integer("grid", columns, low=1)))
-        real_number("pitch", self.pitch, above=0)
-        integer("stride", self.stride, low=1)
-        integer("states", self.states, low=2)
-        integer("reference_every", self.reference_every, low=1)
+        # kept as plain numbers: the hash must not depend on which kind of number was given
+        object.__setattr__(self, "pitch", real_number("pitch", self.pitch, above=0))
+        for name, low in (("stride", 1), ("states", 2), ("reference_every", 1)):
+            object.__setattr__(self, name, integer(name, getattr(self, name), low=low))
         one_of_types("views", self.views, (Views,), "pass Views(...).")
 
     @cached_property
@@ -181,8 +181,9 @@ class SamplePlan(Plan):
     views: Views = field(default_factory=Views)
 
     def __post_init__(self) -> None:
-        integer("states", self.states, low=2)
-        integer("references", self.references, low=0)
+        object.__setattr__(self, "states", integer("states", self.states, low=2))
+        object.__setattr__(self, "blank", bool(self.blank))
+        object.__setattr__(self, "references", integer("references", self.references, low=0))
         one_of_types("views", self.views, (Views,), "pass Views(...).")
 
     @cached_property
