@@ -100,7 +100,10 @@ def _peaks(image: np.ndarray) -> np.ndarray:
     heights = smooth[tuple(peaks.T)]
     order = np.argsort(-heights, kind="stable")
     peaks, heights = peaks[order], heights[order]
-    bright = heights > 0.1 * np.median(heights[: max(1, len(heights) // 2)])
+    # typical is the maximum to which the brighter ones hold half of the light: noise in a wide dark margin has many
+    # maxima, but little light
+    light = np.cumsum(np.maximum(heights, 0))
+    bright = heights > 0.1 * heights[np.searchsorted(light, 0.5 * light[-1])]
     peaks = peaks[bright]
     tree = scipy.spatial.cKDTree(peaks)
     weaker = {j for i, j in (sorted(pair) for pair in tree.query_pairs(0.6 * pitch))}
