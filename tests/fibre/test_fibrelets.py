@@ -38,6 +38,19 @@ def test_every_fibrelet_is_found_once_and_nothing_else(bundle, image):
     assert np.sqrt(np.mean(distance[distance < 1.5] ** 2)) < 0.2
 
 
+@pytest.mark.parametrize("width", [70, 110, 200])
+def test_a_wide_dark_margin_adds_no_fibrelets(width):
+    bundle, pixel = Bundle.hexagonal(radius=20e-6, rng=2), 0.72e-6
+    generator = np.random.default_rng(0)
+    parts = generator.normal(size=(2, 30, 2, bundle.cores))
+    total = (np.abs(bundle.image(parts[0] + 1j * parts[1], (width, width), pixel)) ** 2).sum((0, 1)).astype(float)
+    noisy = generator.poisson(total * 500 / total.max()) + 3 * generator.normal(size=total.shape)
+    found = find_fibrelets(noisy)
+    distance, _ = scipy.spatial.cKDTree(bundle.centres / pixel + (width - 1) / 2).query(found)
+    assert len(found) == bundle.cores
+    assert distance.max() < 1
+
+
 def test_centres_of_separate_spots_are_sub_pixel_for_any_offset():
     y, x = np.mgrid[:90, :90]
     generator = np.random.default_rng(1)
