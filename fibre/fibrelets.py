@@ -122,7 +122,8 @@ def _peaks(image: np.ndarray) -> np.ndarray:
     step[:, 0] = np.where(peaked, (f * c - 2 * e * b) / safe, 0)
     step[:, 1] = np.where(peaked, (f * b - 2 * d * c) / safe, 0)
     centres = peaks + np.clip(step, -1, 1)
-    return centres[np.lexsort((centres[:, 1], centres[:, 0]))]
+    # by the rows of pixels: rounding in the last digit of a centre must not decide about the order
+    return centres[np.lexsort((peaks[:, 1], peaks[:, 0]))]
 
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
