@@ -46,8 +46,12 @@ class SimulatedBench:
         settings = {
             f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
         }
-        digest = hashlib.sha256(self._sample[0].tobytes() + self.scene.bundle.transfer.data.tobytes()).hexdigest()
-        described = {"bench": "simulated", "seed": self.seed, "scene": settings, "contents": digest}
+        bundle, transfer = self.scene.bundle, self.scene.bundle.transfer
+        digest = hashlib.sha256()
+        for part in (self._sample[0], bundle.centres, bundle.mode_radius, transfer.data, transfer.indices):
+            digest.update(np.ascontiguousarray(part).tobytes())
+        settings["wavelength"] = self.wavelength
+        described = {"bench": "simulated", "seed": self.seed, "scene": settings, "contents": digest.hexdigest()}
         return json.loads(json.dumps(described | {"camera": asdict(self.scene.camera)}))
 
     def time(self) -> float:
