@@ -53,9 +53,10 @@ class Folder:
                 file.truncate(len(whole))
         try:
             lines = [json.loads(line) for line in whole.splitlines()]
-        except json.JSONDecodeError as error:
+        except ValueError as error:  # not JSON, or not even text
             raise ValueError(f"folder {self.path} has a damaged {MANIFEST} ({error}); it cannot be resumed.") from error
-        if not all(isinstance(line, dict) for line in lines) or any("id" not in line for line in lines[1:]):
+        parts = {"id", "bytes", "sha256", "exposures", "time"}
+        if not all(isinstance(line, dict) for line in lines) or any(not parts <= line.keys() for line in lines[1:]):
             raise ValueError(f"folder {self.path} has a foreign {MANIFEST}; choose another folder.")
         return lines
 
