@@ -14,7 +14,7 @@ import scipy.optimize
 
 from polinfer.checks import complex_array, real_array
 
-__all__ = ["NoiseScale", "closure_errors", "noise_scale"]
+__all__ = ["NoiseScale", "closure_errors", "closure_phases", "noise_scale"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,39 @@ def closure_errors(fields: np.ndarray, variance: np.ndarray, states: np.ndarray)
         np.einsum("kc,k...->c...", share, variance),
         np.einsum("kc,k...->c...", share, np.abs(fields) ** 2),
     ])  # fmt: skip
+
+
+def closure_phases(fields: np.ndarray, variance: np.ndarray, states: np.ndarray, iterations: int = 200) -> np.ndarray:
+    r"""Phases by which n captures should be turned so that their states close best, (n,) radians of mean 0.
+
+    Minimises :math:`\sum_c \sum |\sum_k c_k e^{i \phi_k} y_k|^2 / \mathrm{var}` over the phases, one after the other
+    (each has a closed form) from 0. Thousands of amplitudes have a say, where a reference spot has a few. With fewer
+    than three states nothing can be told and all phases are 0. Shapes as in :func:`closure_errors`.
+
+    >>> states = np.array([[1, 1, 1], [1, 1j, -1]])
+    >>> turned = np.exp(1j * np.array([[0.1], [-0.2], [0.1]]))
+    >>> fields = turned * np.einsum("an,ax->nx", states, [[0.3, 1.0], [2j, -1.0]])
+    >>> closure_phases(fields, np.ones((3, 2)), states).round(6).tolist()
+    [-0.1, 0.2, -0.1]
+    """
+    states = complex_array("states", states, shape=(2, None), finite=True)
+    count = states.shape[1]
+    if count < 3:
+        return np.zeros(count)
+    null = scipy.linalg.null_space(states)
+    flat = complex_array("fields", fields).reshape(count, -1)
+    weight = 1 / real_array("variance", variance).reshape(count, -1).mean(0)
+    gram = (flat.conj() * weight) @ flat.T
+    matrix = gram * (null.conj() @ null.T)
+    np.fill_diagonal(matrix, 0)
+    turn = np.ones(count, complex)
+    for _ in range(iterations):
+        for k in range(count):
+            pull = matrix[k] @ turn
+            turn[k] = -pull / abs(pull) if pull != 0 else turn[k]
+    phases = np.angle(turn / turn[0])
+    # only differences of phase are seen: keep the captures, on average, where the reference put them
+    return phases - phases.mean()
 
 
 def noise_scale(errors: np.ndarray) -> NoiseScale:

@@ -40,7 +40,7 @@ def find_fibrelets(image: Any) -> np.ndarray:
     (42, True)
     """
     image = real_array("image", image, shape=(None, None), finite=True)
-    return _peaks(image)
+    return _peaks(image, 0.1)
 
 
 def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
@@ -52,7 +52,8 @@ def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
     """
     image = real_array("image", image, shape=(None, None), finite=True)
     pixel_size = real_number("pixel_size", pixel_size, above=0)
-    centres = _peaks(image)
+    # faint neighbours of lit fibrelets matter: light without a mode of its own would be ascribed to others
+    centres = _peaks(image, 0.003)
     middle = (np.array(image.shape) - 1) / 2
     positions = (centres - middle) * pixel_size
     pitch = _pitch(image) * pixel_size
@@ -88,7 +89,7 @@ def _pitch(image: np.ndarray) -> float:
     return float(2 / np.sqrt(3) / best)
 
 
-def _peaks(image: np.ndarray) -> np.ndarray:
+def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
     """Sub-pixel centres (m, 2), row by row."""
     from skimage.feature import peak_local_max
 
@@ -103,7 +104,9 @@ def _peaks(image: np.ndarray) -> np.ndarray:
     # typical is the maximum to which the brighter ones hold half of the light: noise in a wide dark margin has many
     # maxima, but little light
     light = np.cumsum(np.maximum(heights, 0))
-    bright = heights > 0.1 * heights[np.searchsorted(light, 0.5 * light[-1])]
+    bright = heights > faintest * heights[np.searchsorted(light, 0.5 * light[-1])]
+    dark = smooth[smooth <= np.median(smooth)]
+    bright &= heights > np.median(dark) + 10 * 1.4826 * np.median(np.abs(dark - np.median(dark)))
     peaks = peaks[bright]
     tree = scipy.spatial.cKDTree(peaks)
     weaker = {j for i, j in (sorted(pair) for pair in tree.query_pairs(0.6 * pitch))}

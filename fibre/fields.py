@@ -13,7 +13,7 @@ from typing import overload
 import numpy as np
 from tqdm import tqdm
 
-from fibre.closure import NoiseScale, closure_errors, noise_scale
+from fibre.closure import closure_errors, closure_phases, noise_scale
 from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
@@ -40,11 +40,35 @@ class _Amplitudes:
     variance: np.ndarray
     status: np.ndarray
 
+    def of(self, captures: np.ndarray) -> _Amplitudes:
+        """Some of the captures."""
+        return _Amplitudes(self.values[captures], self.variance[captures], self.status[captures])
+
     def in_phase_with(self, reference: np.ndarray) -> _Amplitudes:
         """Turn every capture so that the reference spot has the phase it has alone."""
         overlap = np.einsum("pk,cpk->c", np.conj(reference) * _reference_region(reference), self.values)
-        turned = self.values * np.exp(-1j * np.angle(overlap))[:, None, None]
-        return _Amplitudes(turned, self.variance, self.status)
+        return self.turned(-np.angle(overlap))
+
+    def turned(self, phases: np.ndarray) -> _Amplitudes:
+        """Every capture turned by its phase, radians."""
+        return _Amplitudes(self.values * np.exp(1j * phases)[:, None, None], self.variance, self.status)
+
+    def closed(self, reference: np.ndarray, states: np.ndarray) -> _Amplitudes:
+        """Captures of one scene in several states, turned so that the states close best."""
+        outside = ~_reference_region(reference)
+        phases = closure_phases((self.values - reference)[..., outside], self.variance[..., outside], states)
+        return self.turned(phases)
+
+
+def _mean_reference(reference: _Amplitudes) -> np.ndarray:
+    """The reference spot alone, complex (2, m), 0 where its light is not clearly above the noise.
+
+    It is subtracted from every capture; subtracting noise would put the same error into all states, where their
+    closure cannot see it. The image noise is some ten times less than what retrieval really leaves in the dark.
+    """
+    mean = reference.in_phase_with(reference.values[0]).values.mean(0)
+    noise = 10 * reference.variance.mean(0) / len(reference.values)
+    return mean * np.maximum(1 - noise / np.maximum(np.abs(mean) ** 2, 1e-300), 0)
 
 
 def _reference_region(reference: np.ndarray) -> np.ndarray:
@@ -71,7 +95,10 @@ def retrieve_fields(
 
     H comes from the defocused images by ``method``, V = (H^* V)/H^* from the phase-stepped ones, each projected on
     the modes by weighted least squares. The common phase that intensities cannot know is fixed by the reference spot,
-    which every capture contains; its own light is then subtracted.
+    which every capture contains, and then, between the states of one scene, by their closure
+    (:func:`fibre.closure.closure_phases`): the spot lights a dozen fibrelets, the scene hundreds. The spot's own light
+    is then subtracted. The spot must stand clear of the sample: light of the sample on the spot's fibrelets turns the
+    phase of its capture.
 
     The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power,
     both found from the data: n states of illumination span two dimensions, so n - 2 combinations of the fields must
@@ -93,9 +120,13 @@ def retrieve_fields(
         if fibrelets is None:
             fibrelets = _find(record.images)
         reference = _retrieve(record.references, method, fibrelets, progress, "reference")
-        mean_reference = reference.in_phase_with(reference.values[0]).values.mean(0)
+        mean_reference = _mean_reference(reference)
         fields = _retrieve(record.images, method, fibrelets, progress, "calibration").in_phase_with(mean_reference)
-        noise = _calibration_noise(fields, record, mean_reference)
+        groups = _groups(record)
+        for chosen, states in groups:
+            fields.values[chosen] = fields.of(chosen).closed(mean_reference, states).values
+        errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
+        noise = noise_scale(np.concatenate([np.empty((3, 0)), *errors], axis=1))
         return CalibrationFields(
             fields.values - mean_reference,
             noise.variance(fields.values, fields.variance),
@@ -112,9 +143,10 @@ def retrieve_fields(
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
     reference = _retrieve(record.references, method, fibrelets, progress, "reference")
-    mean_reference = reference.in_phase_with(reference.values[0]).values.mean(0)
+    mean_reference = _mean_reference(reference)
     fields = _retrieve(record.images, method, fibrelets, progress, "sample").in_phase_with(mean_reference)
     blank = _retrieve(record.blank, method, fibrelets, progress, "blank").in_phase_with(mean_reference)
+    fields, blank = (part.closed(mean_reference, record.illumination) for part in (fields, blank))
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
     noise = noise_scale(np.concatenate(errors, axis=1))
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
@@ -189,18 +221,16 @@ def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> 
     return np.stack([squared, stated, power]).reshape(3, -1)
 
 
-def _calibration_noise(fields: _Amplitudes, calibration: Calibration, reference: np.ndarray) -> NoiseScale:
-    """Noise from the closure of captures that light the same points in different states."""
+def _groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Captures that light the same points, and their states (2, n)."""
     inputs = calibration.inputs.tocsc()
     count = len(calibration.points)
     groups: dict[tuple[int, ...], list[int]] = {}
     for capture in range(inputs.shape[1]):
         rows = inputs.indices[inputs.indptr[capture] : inputs.indptr[capture + 1]]
         groups.setdefault(tuple(sorted(set(rows % count))), []).append(capture)
-    errors = [np.empty((3, 0))]
-    for points, captures in groups.items():
-        states = inputs[[points[0], points[0] + count], :][:, captures].toarray()
-        chosen = np.array(captures)
-        part = _Amplitudes(fields.values[chosen], fields.variance[chosen], fields.status[chosen])
-        errors.append(_closure(part, reference, states))
-    return noise_scale(np.concatenate(errors, axis=1))
+    return [
+        (np.array(captures), inputs[[points[0], points[0] + count], :][:, captures].toarray())
+        for points, captures in groups.items()
+        if points
+    ]

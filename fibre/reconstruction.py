@@ -32,9 +32,10 @@ def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurem
     calibration, which enters both, for all states, and over the neighbourhood; its covariance is
     :func:`fibre.calibration.response_covariance`. Those errors are correlated over the states, so what counts is what
     they do to J, :math:`\sigma^2 = \tfrac14 \sum_p \sum_{st} E[e_{ps} e_{pt}^*] (U^+ U)_{st}`: the sigma of
-    independent errors that would give J the same mean square error. H and V differ in noise, and so do the states;
-    one sigma does not say so. To this is added, in the same way, what the regularisation mixes in from neighbours that
-    differ, estimated by sending the estimates through :math:`A^{-1} \hat A` once more.
+    independent errors with the same :math:`E\,\mathrm{tr}[\delta J U U^H \delta J^H]`, the error as the likelihood
+    weighs it. H and V differ in noise, and so do the states; one sigma does not say so. To this is added, in the same
+    way, what the regularisation mixes in from neighbours that differ, estimated by sending the estimates through
+    :math:`A^{-1} \hat A` once more.
 
     Raises
     ------

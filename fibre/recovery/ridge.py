@@ -28,7 +28,7 @@ class Ridge(RecoveryMethod):
     .. math:: a = \arg\min \; \| e - a \hat A \|^2 + \sum_k |a_k|^2 \Lambda_k, \quad
               \Lambda_k = \sum_j \mathrm{var}(\hat A_{kj})
 
-    which is the expectation of :math:`\|e - a A\|^2` over the true A given the measured one (flat prior). So the
+    which is the expectation of :math:`\|e - a A\|^2` over the true A given the measured fields. So the
     regularisation is set by the noise and not by hand; ``strength`` multiplies it.
 
     Parameters

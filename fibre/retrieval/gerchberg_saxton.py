@@ -95,12 +95,14 @@ def _solve(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     images = masks.shape[0]
     back = jnp.conj(masks)
+    # what a mask does not pass, its plane says nothing about: it is left as it is
+    unseen = 1 - jnp.abs(masks) ** 2
     usable = (weights > 0).astype(weights.dtype)
 
     def sweep(spectrum: jax.Array) -> jax.Array:
         for i in range(images):
             view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], usable[:, i])
-            spectrum = jnp.fft.fft2(view) * back[i]
+            spectrum = jnp.fft.fft2(view) * back[i] + spectrum * unseen[i]
         return spectrum
 
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -115,7 +117,8 @@ def _solve(
 
     def average(_: int, spectrum: jax.Array) -> jax.Array:
         view = jnp.fft.ifft2(spectrum[:, None] * masks)
-        return (jnp.fft.fft2(_project(view, amplitudes, weights)) * back).mean(1)
+        moved = jnp.fft.fft2(_project(view, amplitudes, weights)) * back
+        return (moved + spectrum[:, None] * unseen).mean(1)
 
     first = jnp.fft.fft2(amplitudes[:, 0] * jnp.exp(1j * phase)) * back[0]
     start = (first, jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype), jnp.array(0))
