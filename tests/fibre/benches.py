@@ -6,9 +6,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from acquisition import Bracket, CalibrationPlan, CameraModel, SamplePlan, Scene, SimulatedBench, Views, calibrate, capture
-from fibre import Bundle, Calibration, CalibrationFields, Fibrelets, GerchbergSaxton, Recording, RecordingFields
-from fibre import retrieve_fields
+from acquisition import (
+    Bracket,
+    CalibrationPlan,
+    CameraModel,
+    SamplePlan,
+    Scene,
+    SimulatedBench,
+    Views,
+    calibrate,
+    capture,
+)
+from fibre import (
+    Bundle,
+    Calibration,
+    CalibrationFields,
+    Fibrelets,
+    GerchbergSaxton,
+    Recording,
+    RecordingFields,
+    retrieve_fields,
+)
 from polinfer import phantoms
 
 VIEWS = Views(diversity=(-5e-5, -2.5e-5, 0.0, 2.5e-5, 5e-5), bracket=Bracket(64e-3, 4.0, 1e-3))

@@ -1,0 +1,81 @@
+"""The whole chain, from a simulated bench to fitted parameters, ends at the truth within the stated noise."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fibre
+from acquisition import demo
+from acquisition.demo import report, run_demo
+from acquisition.run import Folder
+from polinfer import Parameters
+from polinfer.cli import main
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("demo")
+
+
+@pytest.fixture(scope="module")
+def result(folder):
+    return run_demo(folder, 0)
+
+
+def test_the_fitted_jones_matrices_are_true_within_the_noise(result):
+    chi_square, freedom, pixels = result.chi_square
+    assert pixels >= 300
+    assert 0.7 < chi_square / freedom < 1.4
+
+
+def test_every_file_is_there_and_loads(result, folder):
+    names = {path.name for path in result.files}
+    assert {"phantom.nc", "inverse.nc", "measurement.nc", "fit.nc", "maps.png"} <= names
+    for path in result.files:
+        assert path.parent == folder
+        if path.suffix == ".nc":
+            fibre.load(path)
+        else:
+            assert path.read_bytes()[:4] == b"\x89PNG"
+    np.testing.assert_array_equal(fibre.load(folder / "fit.nc").parameters.retardance, result.fit.parameters.retardance)
+
+
+def test_a_second_run_takes_no_new_capture(result, folder, monkeypatch):
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/*.npz")}
+    assert len(before) > 50
+
+    class Enough(Exception):
+        pass
+
+    def stop(*arguments, **keywords):
+        raise Enough
+
+    monkeypatch.setattr(Folder, "store", lambda *arguments: pytest.fail("a capture was taken again"))
+    monkeypatch.setattr(fibre, "retrieve_fields", stop)  # both captures are done when the first fields are asked for
+    with pytest.raises(Enough):
+        run_demo(folder, 0)
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*.npz")} == before
+
+
+def test_the_report_names_every_parameter_and_the_chi_square(result):
+    lines = []
+    report(result, lines.append)
+    text = "\n".join(lines)
+    for name in Parameters._fields:
+        assert name in text
+    assert f"{result.chi_square[0] / result.chi_square[1]:.2f}" in text
+
+
+def test_the_bench_of_the_demo_is_not_what_the_recovery_believes():
+    scene = demo.demo_scene(0)
+    assert scene.focus_error
+    assert scene.step_error
+    assert scene.sample_oversampling > 1
+
+
+def test_the_command_explains_itself():
+    shown = CliRunner().invoke(main, ["demo", "--help"])
+    assert shown.exit_code == 0
+    assert "Example: polinfer demo" in shown.output
+    assert "--seed" in shown.output
+    assert CliRunner().invoke(main, ["demo", "--seed", "-1"]).exit_code == 2

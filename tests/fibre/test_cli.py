@@ -1,0 +1,75 @@
+"""The commands go from captured frames to Jones data, as the library does, and mistakes end in one line."""
+
+import numpy as np
+import pytest
+import scipy.spatial
+from click.testing import CliRunner
+
+from fibre import CalibrationFields, RecordingFields, Ridge, load, reconstruct, recover, save
+from polinfer.cli import main
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def test_frames_become_jones_data_by_four_commands(bench, tmp_path):
+    calibration, sample = tmp_path / "calibration.nc", tmp_path / "sample.nc"
+    save(bench.calibration, calibration)
+    save(bench.recording, sample)
+    fields, inverse = tmp_path / "calibration-fields.nc", tmp_path / "inverse.nc"
+    sample_fields, measurement = tmp_path / "sample-fields.nc", tmp_path / "measurement.nc"
+    for arguments in (
+        ("retrieve", calibration, fields, "--iterations", 60),
+        ("recover", fields, inverse, "--window", 30),
+        ("retrieve", sample, sample_fields, "--fibrelets", fields, "--iterations", 60),
+        ("reconstruct", inverse, sample_fields, measurement),
+    ):
+        result = run(*arguments)
+        assert result.exit_code == 0, result.output
+        assert "wrote" in result.output
+    assert "(4, 4) points, 3 states" in result.output
+    found = load(fields)
+    assert isinstance(found, CalibrationFields)
+    assert isinstance(load(sample_fields), RecordingFields)
+    # the calibration has found its own fibrelets: those that were lit, each where it is
+    distance, core = scipy.spatial.cKDTree(bench.scene.bundle.centres).query(found.fibrelets.centres)
+    assert distance.max() < 0.5e-6
+    assert len(set(core)) == len(core) > 25
+    assert found.fibrelets.mode_radius == pytest.approx(1.6e-6, rel=0.03)
+    expected = reconstruct(recover(found, Ridge(window=30e-6)), load(sample_fields))
+    np.testing.assert_allclose(load(measurement).response, expected.response, rtol=1e-9)
+    np.testing.assert_allclose(load(measurement).sigma, expected.sigma, rtol=1e-9)
+
+
+@pytest.mark.parametrize("command", ["retrieve", "recover", "reconstruct"])
+def test_every_command_has_help_with_an_example(command):
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert f"Example: polinfer {command}" in result.output
+    assert command in run("--help").output
+
+
+def test_mistakes_end_in_one_line_and_exit_code_2(bench, tmp_path):
+    fields = save(bench.calibration_fields, tmp_path / "fields.nc")
+    sample = save(bench.recording, tmp_path / "sample.nc")
+    broken, out = tmp_path / "broken.nc", tmp_path / "out.nc"
+    broken.write_bytes(b"nothing")
+    cases = [
+        (("retrieve", tmp_path / "missing.nc", out), "does not exist"),
+        (("retrieve", broken, out), "cannot be read"),
+        (("retrieve", fields, out), "holds a CalibrationFields, not a Calibration or Recording"),
+        (("retrieve", sample, out), "fibrelets must be given"),
+        (("retrieve", sample, out, "--fibrelets", sample), "holds a Recording, not a CalibrationFields"),
+        (("retrieve", sample, out, "--fibrelets", fields, "--iterations", 0), "iterations must be >= 1"),
+        (("recover", sample, out), "holds a Recording, not a CalibrationFields"),
+        (("recover", fields, out, "--window", -1), "window must be > 0"),
+        (("recover", fields, fields), "exists"),
+        (("reconstruct", fields, fields, out), "holds a CalibrationFields, not a Inverse"),
+    ]
+    for arguments, text in cases:
+        result = run(*arguments)
+        assert result.exit_code == 2, (arguments, result.output)
+        assert text in result.output
+        assert "Traceback" not in result.output
+    assert not out.exists()

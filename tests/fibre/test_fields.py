@@ -1,0 +1,109 @@
+"""From camera frames of a simulated bench to mode amplitudes, compared with the true ones."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from fibre import Ridge, reconstruct, recover, retrieve_fields
+from fibre.retrieval.base import RetrievalMethod
+from tests.fibre.benches import METHOD, PLAN
+from tests.oracles import jones as oracle
+
+
+def aligned(fields, bench):
+    """Turned by the one phase that all of a calibration shares: the reference spot's own."""
+    return fields * np.exp(-1j * np.angle(np.vdot(bench.reference, bench.calibration_fields.reference)))
+
+
+def truth(bench):
+    """True amplitudes of every calibration capture, (captures, 2, m)."""
+    x = PLAN.inputs.toarray().reshape(2, 16, -1)
+    return np.stack([bench.seen(x[:, :, c]) for c in range(x.shape[2])])
+
+
+def test_the_amplitudes_are_the_true_ones_to_a_few_per_cent(bench):
+    found, true = aligned(bench.calibration_fields.fields, bench), truth(bench)
+    error = np.linalg.norm(found - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert np.all(error < 0.04)
+    assert np.median(error) < 0.015
+
+
+def test_the_phase_of_v_against_h_and_of_captures_against_each_other_is_right(bench):
+    """One phase for everything is free; a wrong sign of the steps, or a piston left over, would show here."""
+    found, true = aligned(bench.calibration_fields.fields, bench), truth(bench)
+    for p in range(2):
+        overlap = np.einsum("ck,ck->c", true[:, p].conj(), found[:, p])
+        assert np.abs(np.angle(overlap)).max() < 0.03
+
+
+def test_the_reference_spot_is_the_true_one(bench):
+    found = aligned(bench.calibration_fields.reference, bench)
+    assert np.linalg.norm(found - bench.reference) < 0.02 * np.linalg.norm(bench.reference)
+
+
+def test_the_stated_variance_is_that_of_the_typical_error(bench):
+    """Median over median of an exponential variable; errors that all states share stay unseen and are rarer."""
+    fields = bench.calibration_fields
+    ratio = np.abs(aligned(fields.fields, bench) - truth(bench)) ** 2 / fields.variance
+    assert 0.4 < np.median(ratio) / np.log(2) < 2.5
+    assert fields.inflation >= 1
+    assert 0 <= fields.relative_error < 0.03
+
+
+def test_the_illumination_states_close(bench):
+    fields = bench.recording_fields
+    null = np.linalg.svd(fields.illumination)[2][2].conj()
+    for part, variance in ((fields.fields, fields.variance), (fields.blank, fields.blank_variance)):
+        closure = np.abs(np.einsum("n,npk->pk", null, part)) ** 2
+        stated = np.einsum("n,npk->pk", np.abs(null) ** 2, variance)
+        assert 0.2 < np.median(closure / stated) / np.log(2) < 3
+
+
+def test_fields_go_with_what_the_captures_were(bench):
+    fields, calibration = bench.calibration_fields, bench.calibration
+    assert fields.fields.shape == fields.variance.shape == (12, 2, 73)
+    np.testing.assert_array_equal(fields.inputs.toarray(), calibration.inputs.toarray())
+    np.testing.assert_array_equal(fields.points, calibration.points)
+    assert fields.grid == calibration.grid
+    np.testing.assert_array_equal(bench.recording_fields.illumination, bench.recording.illumination)
+
+
+@dataclass(frozen=True)
+class Turned(RetrievalMethod):
+    """Another method with an arbitrary phase on every field, as intensities leave it."""
+
+    inner: RetrievalMethod
+
+    def solve(self, amplitudes, weights, masks):
+        found = self.inner.solve(amplitudes, weights, masks)
+        phase = np.random.default_rng(len(found.field)).uniform(-np.pi, np.pi, (len(found.field), 1, 1))
+        return replace(found, field=(found.field * np.exp(1j * phase)).astype(np.complex64))
+
+
+def test_the_phase_of_whole_captures_does_not_matter(bench):
+    fibrelets = bench.calibration_fields.fibrelets
+    turned = retrieve_fields(bench.recording, Turned(METHOD), fibrelets)
+    for name in ("fields", "blank"):
+        found, usual = getattr(turned, name), getattr(bench.recording_fields, name)
+        # the piston of the reference is what it is: one phase for the whole recording, blank and sample
+        phase = np.angle(np.vdot(bench.recording_fields.blank, turned.blank))
+        assert np.linalg.norm(found * np.exp(-1j * phase) - usual) < 1e-3 * np.linalg.norm(usual)
+
+
+def test_jones_matrices_from_frames_are_the_samples(bench):
+    measurement = reconstruct(recover(bench.calibration_fields, Ridge()), bench.recording_fields)
+    found = measurement.response @ np.linalg.pinv(measurement.illumination)
+    scene = bench.scene.phantom
+    true = np.array([oracle.jones(x) for x in np.stack([p.ravel() for p in scene.parameters], 1)])
+    true = true.reshape(4, 4, 2, 2) * scene.gain[..., None, None]
+    error = np.linalg.norm(found - true, axis=(2, 3)) / np.linalg.norm(true, axis=(2, 3))
+    assert np.median(error) < 0.1
+    assert np.all(measurement.sigma > 0)
+
+
+def test_other_records_and_recordings_without_fibrelets_are_refused(bench):
+    with pytest.raises(TypeError, match="record must be Calibration or Recording"):
+        retrieve_fields(bench.calibration_fields, METHOD)
+    with pytest.raises(ValueError, match="fibrelets must be given for a Recording"):
+        retrieve_fields(bench.recording, METHOD)
