@@ -57,12 +57,21 @@ class Profile:
 
 
 def _lit(fields: CalibrationFields) -> list[np.ndarray]:
-    """Points lit in each capture."""
+    """Points lit in each capture; every point must be lit somewhere, in two states or more."""
     inputs, count = fields.inputs.tocsc(), len(fields.points)
     lit = [np.unique(inputs.indices[inputs.indptr[c] : inputs.indptr[c + 1]] % count) for c in range(inputs.shape[1])]
     missing = sorted(set(range(count)) - {int(point) for points in lit for point in points})
     if missing:
         raise ValueError(f"inputs must light every point, but never light {len(missing)} of them, first {missing[0]}.")
+    h, v = inputs[:count], inputs[count:]
+    powers = [np.asarray(abs(part).power(2).sum(axis=1)).ravel() for part in (h, v)]
+    overlap = np.asarray(h.conj().multiply(v).sum(axis=1)).ravel()
+    single = np.flatnonzero(powers[0] * powers[1] - np.abs(overlap) ** 2 < 1e-9 * (powers[0] + powers[1]) ** 2)
+    if len(single):
+        raise ValueError(
+            f"inputs must light every point in two states of polarisation or more, but {len(single)} points have one, "
+            f"first {single[0]}."
+        )
     return lit
 
 

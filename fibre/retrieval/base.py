@@ -52,6 +52,9 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     :func:`fibre.retrieve_fields` compares it with the closure of the illumination states. MISFIT is raised where the
     mean squared amplitude misfit exceeds twice what the image noise explains plus 1 % of the mean intensity.
 
+    Distances of the wrong sign give the complex conjugate of the field, which fits its images as well: no status can
+    tell.
+
     Raises
     ------
     TypeError: ``diversity`` or ``method`` is something else.

@@ -184,7 +184,7 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
     if progress:
         from tqdm import tqdm
 
-        chunks = tqdm(chunks, unit="chunk")
+        chunks = tqdm(chunks, desc="fit", unit="chunk")
     parts = []
     for begin in chunks:
         part = slice(begin, begin + CHUNK)

@@ -164,6 +164,10 @@ def test_a_calibration_that_leaves_points_dark_or_misses_the_fibre_is_an_error(s
     inputs[[9, 64 + 9]] = 0
     with pytest.raises(ValueError, match="inputs must light every point, but never light 1 of them, first 9"):
         columns(replace(fields, inputs=scipy.sparse.csr_array(inputs)))
+    inputs = fields.inputs.toarray()
+    inputs[5], inputs[64 + 5] = 1.0 * (inputs[5] != 0), 1j * (inputs[5] != 0)
+    with pytest.raises(ValueError, match="in two states of polarisation or more, but 1 points have one, first 5"):
+        columns(replace(fields, inputs=scipy.sparse.csr_array(inputs)))
     noise = complex_noise(np.random.default_rng(0), fields.fields.shape) * NOISE
     with pytest.raises(ValueError, match="too few lit fibrelets"):
         columns(replace(fields, fields=noise))
