@@ -23,11 +23,12 @@ class RetrievalMethod(ABC):
     """A method of phase retrieval: a frozen object of settings with one function."""
 
     @abstractmethod
-    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> Solution:
+    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray, noise: np.ndarray) -> Solution:
         """Fields of a small batch.
 
         ``amplitudes`` float32 (b, m, y, x), square roots of the images; ``weights`` float32, the same shape, inverse
-        variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable; ``masks`` complex64 (m, y, x).
+        variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable; ``masks`` complex64 (m, y, x);
+        ``noise`` float32 (b), the noise of the amplitudes over the amplitudes (weighted), 0 where it is not known.
         """
 
 
@@ -84,7 +85,7 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
         part = slice(start, min(start + batch, count))
         amplitudes = np.sqrt(np.maximum(intensities[part], 0)).astype(np.float32)
         weights, best = _weights(amplitudes, None if variance is None else variance[part])
-        found = method.solve(amplitudes, weights, masks)
+        found = method.solve(amplitudes, weights, masks, _relative_noise(amplitudes, weights, best))
         field[part], iterations[part] = found.field, found.iterations
         floor[part], misfitted = _noise(found.field, amplitudes, weights, best, masks)
         status[part] = np.where(found.converged, 0, RetrievalStatus.NOT_CONVERGED)
@@ -109,6 +110,13 @@ def _weights(amplitudes: np.ndarray, variance: np.ndarray | None) -> tuple[np.nd
     spread = deviation**2 / (4 * np.maximum(amplitudes**2, deviation))
     best = np.where(usable, spread, np.inf).min((1, 2, 3))
     return np.where(usable, best[:, None, None, None] / spread, 0).astype(np.float32), best
+
+
+def _relative_noise(amplitudes: np.ndarray, weights: np.ndarray, best: np.ndarray | None) -> np.ndarray:
+    if best is None:
+        return np.zeros(len(amplitudes), np.float32)
+    power = (weights * amplitudes**2).sum((1, 2, 3))
+    return np.sqrt(best * (weights > 0).sum((1, 2, 3)) / np.maximum(power, 1e-30)).astype(np.float32)
 
 
 def misfit(field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> np.ndarray:

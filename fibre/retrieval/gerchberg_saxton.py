@@ -35,9 +35,11 @@ class GerchbergSaxton(RetrievalMethod):
 
     Parameters
     ----------
-    iterations: most sweeps, >= 1. averaging: iterations of the mean afterwards, >= 0. tolerance: relative change of
-    the field per sweep at which the sweeps stop. restarts: >= 0. Distances decide more than iterations: with planes
-    in which light has spread over tens of fibrelets, some 50 sweeps do; a few fibrelets, hundreds.
+    iterations: most sweeps, >= 1. averaging: iterations of the mean afterwards, >= 0. tolerance: the sweeps stop when
+    the field changes by less than this per sweep, or than a tenth of the images' relative noise; 0: never. restarts:
+    >= 0. coarsening: the first sweeps take one pixel in so many and low frequencies only (1: all from the start, also
+    where a side of the frame is not a multiple of twice that). Distances decide more than iterations: with planes in
+    which light has spread over tens of fibrelets, some 50 sweeps do; a few fibrelets, hundreds.
 
     Source: Gerchberg and Saxton (1972) and its through-focus form, as used by the paper with about 200 iterations.
     """
@@ -46,35 +48,77 @@ class GerchbergSaxton(RetrievalMethod):
     averaging: int = 20
     tolerance: float = 2e-3
     restarts: int = 2
+    coarsening: int = 2
 
     def __post_init__(self) -> None:
         integer("iterations", self.iterations, low=1)
         integer("averaging", self.averaging, low=0)
         real_number("tolerance", self.tolerance, low=0)
         integer("restarts", self.restarts, low=0)
+        integer("coarsening", self.coarsening, low=1)
 
-    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> Solution:
+    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray, noise: np.ndarray) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
-        settings = (self.iterations, self.averaging, self.tolerance)
-        arguments = (jnp.asarray(amplitudes), jnp.asarray(weights), jnp.asarray(masks))
-        flat = jnp.zeros(amplitudes.shape[-2:], amplitudes.dtype)
-        field, change, count = (np.array(part) for part in _solve(*arguments, flat, *settings))
+        # the planes' noise keeps the field moving by a few per cent of it, however long one waits
+        tolerance = np.asarray(np.maximum(self.tolerance, 0.1 * noise) * (self.tolerance > 0), np.float32)
+        settings = (self.iterations, self.averaging)
+        coarse = self.coarsening if all(n % (2 * self.coarsening) == 0 for n in amplitudes.shape[-2:]) else 1
+        flat = np.zeros(amplitudes.shape[-2:], amplitudes.dtype)
+        field, change, count = _run(amplitudes, weights, masks, flat, tolerance, *settings, coarse)
         spent = np.full(len(field), count + self.averaging)
         left = misfit(field, amplitudes, weights, masks)
         for restart in range(self.restarts):
             # a stagnated field leaves several times the misfit of its neighbours; noise differs far less
-            suspect = (change > self.tolerance) | (left > 1.5 * np.median(left))
+            suspect = (change > tolerance) | (left > 1.5 * np.median(left))
             if not suspect.any():
                 break
-            phase = np.random.default_rng(restart).uniform(-np.pi, np.pi, flat.shape).astype(amplitudes.dtype)
+            phase = np.random.default_rng(restart).uniform(-np.pi, np.pi, size=flat.shape)
             # correlated over a few pixels, several radians deep
-            smooth = jnp.asarray(scipy.ndimage.gaussian_filter(phase, 4.0, mode="wrap") * 20)
-            again, moved, count = (np.array(part) for part in _solve(*arguments, smooth, *settings))
-            other = misfit(again, amplitudes, weights, masks)
-            better = suspect & (other < left)
-            field[better], change[better], left[better] = again[better], moved[better], other[better]
-            spent[suspect] += count + self.averaging
-        return Solution(field, change <= max(self.tolerance, 1e-2), spent)
+            smooth = scipy.ndimage.gaussian_filter(phase, 4.0, mode="wrap") * 20
+            chosen = np.flatnonzero(suspect)
+            # code is compiled for a shape: pad to a power of two, so that few shapes occur
+            padded = np.resize(chosen, 1 << (len(chosen) - 1).bit_length())
+            again, moved, count = _run(
+                amplitudes[padded], weights[padded], masks, smooth, tolerance[padded], *settings, 1
+            )
+            other = misfit(again, amplitudes[padded], weights[padded], masks)
+            for i, k in enumerate(chosen):
+                if other[i] < left[k]:
+                    field[k], change[k], left[k] = again[i], moved[i], other[i]
+            spent[chosen] += count + self.averaging
+        return Solution(field, change <= np.maximum(tolerance, 1e-2), spent)
+
+
+def _run(
+    amplitudes: np.ndarray,
+    weights: np.ndarray,
+    masks: np.ndarray,
+    phase: np.ndarray,
+    tolerance: np.ndarray,
+    iterations: int,
+    averaging: int,
+    coarse: int,
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Fields, their last relative change and the number of sweeps, from a phase in the first plane."""
+    first = np.fft.fft2(amplitudes[:, 0] * np.exp(1j * phase)) * np.conj(masks[0])
+    if coarse > 1:
+        # every second pixel samples the same field, and low frequencies alone make a good start at less cost
+        few = (..., slice(None, None, coarse), slice(None, None, coarse))
+        low = [np.fft.ifftshift(_middle(n, coarse)) for n in masks.shape[-2:]]
+        place = (..., low[0][:, None], low[1])
+        spectrum, _, _ = _solve(
+            amplitudes[few], weights[few], masks[place], first[place] / coarse**2, 3 * tolerance, iterations, 0
+        )
+        first = np.zeros_like(first)
+        first[place] = np.asarray(spectrum) * coarse**2
+    spectrum, change, count = _solve(amplitudes, weights, masks, first, tolerance, iterations, averaging)
+    return np.array(jnp.fft.ifft2(spectrum)), np.array(change), int(count)
+
+
+def _middle(count: int, coarse: int) -> np.ndarray:
+    """Places in the spectrum of ``count`` samples of the lowest frequencies that ``count / coarse`` samples have."""
+    few = count // coarse
+    return np.arange(-few // 2, few // 2) % count
 
 
 def _project(view: jax.Array, amplitude: jax.Array, weight: jax.Array) -> jax.Array:
@@ -83,16 +127,17 @@ def _project(view: jax.Array, amplitude: jax.Array, weight: jax.Array) -> jax.Ar
     return view * (1 + weight * (amplitude / jnp.maximum(modulus, 1e-20) - 1))
 
 
-@partial(jax.jit, static_argnums=(4, 5))
+@partial(jax.jit, static_argnums=(5, 6))
 def _solve(
     amplitudes: jax.Array,
     weights: jax.Array,
     masks: jax.Array,
-    phase: jax.Array,
+    first: jax.Array,
+    tolerance: jax.Array,
     iterations: int,
     averaging: int,
-    tolerance: float,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Spectra from the spectra ``first``, the last relative change, and the number of sweeps."""
     images = masks.shape[0]
     back = jnp.conj(masks)
     # what a mask does not pass, its plane says nothing about: it is left as it is
@@ -120,8 +165,7 @@ def _solve(
         moved = jnp.fft.fft2(_project(view, amplitudes, weights)) * back
         return (moved + spectrum[:, None] * unseen).mean(1)
 
-    first = jnp.fft.fft2(amplitudes[:, 0] * jnp.exp(1j * phase)) * back[0]
-    start = (first, jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype), jnp.array(0))
+    start = (first.astype(masks.dtype), jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype), jnp.array(0))
     spectrum, change, count = jax.lax.while_loop(unfinished, step, start)
     spectrum = jax.lax.fori_loop(0, averaging, average, spectrum)
-    return jnp.fft.ifft2(spectrum), change, count
+    return spectrum, change, count

@@ -75,8 +75,8 @@ class Turned(RetrievalMethod):
 
     inner: RetrievalMethod
 
-    def solve(self, amplitudes, weights, masks):
-        found = self.inner.solve(amplitudes, weights, masks)
+    def solve(self, amplitudes, weights, masks, noise):
+        found = self.inner.solve(amplitudes, weights, masks, noise)
         phase = np.random.default_rng(len(found.field)).uniform(-np.pi, np.pi, (len(found.field), 1, 1))
         return replace(found, field=(found.field * np.exp(1j * phase)).astype(np.complex64))
 
