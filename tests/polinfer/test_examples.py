@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import polinfer
 
 from .test_datasets import fibre_folder
@@ -30,7 +28,6 @@ def test_one_pixel(tmp_path):
     assert isinstance(polinfer.load(tmp_path / "one_pixel.nc"), polinfer.Fit)
 
 
-@pytest.mark.slow
 def test_measured_fibre(tmp_path):
     fibre_folder()
     assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)
