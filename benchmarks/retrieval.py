@@ -31,7 +31,7 @@ def main() -> None:
     amplitudes[:, 0] = rng.standard_normal((4, bundle.cores)) + 1j * rng.standard_normal((4, bundle.cores))
     truth = amplitudes[:, 0]
     images = np.abs(bundle.image(amplitudes, SHAPE, PIXEL, PLANES * 1.003)[:, :, 0]) ** 2
-    modes = mode_matrix(Fibrelets(bundle.centres, float(bundle.mode_radius.mean())), SHAPE, PIXEL)
+    modes = mode_matrix(Fibrelets(bundle.centres, bundle.mode_radius.mean()), SHAPE, PIXEL)
     solve = scipy.sparse.linalg.splu((modes.T @ modes).astype(complex).tocsc()).solve
     stack = jnp.asarray(images.astype(np.complex64))
     pair = jax.jit(lambda a: jnp.fft.ifft2(jnp.fft.fft2(a)))

@@ -44,11 +44,11 @@ def find_fibrelets(image: Any) -> np.ndarray:
 
 
 def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
-    r"""Centres and common mode radius of the fibrelets in an intensity image, in metres from the frame's middle.
+    r"""Centres and mode radii of the fibrelets in an intensity image, in metres from the frame's middle.
 
-    The radius w is the one whose sum of spots :math:`\sum_k p_k e^{-2 |r - r_k|^2 / w^2}`, with heights p by least
-    squares, leaves the least of the image over. ``image`` should be an incoherent sum of many fields, so that
-    neighbours do not interfere in it.
+    The common radius w is the one whose sum of spots :math:`\sum_k p_k e^{-2 |r - r_k|^2 / w^2}`, with heights p by
+    least squares, leaves the least of the image over; from it each fibrelet's own is refined. ``image`` should be an
+    incoherent sum of many fields, so that neighbours do not interfere in it.
     """
     image = real_array("image", image, shape=(None, None), finite=True)
     pixel_size = real_number("pixel_size", pixel_size, above=0)
@@ -68,7 +68,36 @@ def locate_fibrelets(image: Any, pixel_size: float) -> Fibrelets:
     best = scipy.optimize.minimize_scalar(
         left_over, bounds=(0.15 * pitch, 0.6 * pitch), method="bounded", options={"xatol": 1e-4 * pitch}
     )
-    return Fibrelets(positions, float(best.x))
+    return Fibrelets(positions, _own_radii(image, pixel_size, positions, float(best.x)))
+
+
+def _own_radii(
+    image: np.ndarray, pixel_size: float, positions: np.ndarray, common: float, spread: float = 0.03
+) -> np.ndarray:
+    """Radii of the single modes, (m,): Gauss-Newton steps on heights and radii from the common radius.
+
+    A prior of relative width ``spread`` holds the radius of a faint fibrelet at the common one. It matters: a mode that
+    is 2 % too narrow leaves a tail that its dark neighbour is then thought to carry.
+    """
+    radii = np.full(len(positions), common)
+    target, step = image.ravel(), 0.01
+    for _ in range(3):
+        spots, wider, narrower = (
+            mode_matrix(Fibrelets(positions, radii * factor / np.sqrt(2)), image.shape, pixel_size)
+            for factor in (1, 1 + step, 1 - step)
+        )
+        # of a spot of constant height, against the logarithm of its radius
+        slope = ((1 + step) * wider - (1 - step) * narrower) / (2 * step)
+        heights = scipy.sparse.linalg.spsolve((spots.T @ spots).tocsc(), spots.T @ target)
+        left = target - spots @ heights
+        scaled = slope @ scipy.sparse.diags_array(heights)
+        both = scipy.sparse.hstack([spots, scaled])
+        prior = np.concatenate([np.zeros(len(radii)), np.full(len(radii), np.mean(left**2) / spread**2)])
+        normal = (both.T @ both + scipy.sparse.diags_array(prior)).tocsc()
+        pull = prior * np.concatenate([np.zeros(len(radii)), np.log(common / radii)])
+        change = scipy.sparse.linalg.spsolve(normal, both.T @ left + pull)[len(radii) :]
+        radii = radii * np.exp(np.clip(change, -0.05, 0.05))
+    return radii
 
 
 def _pitch(image: np.ndarray) -> float:
@@ -131,8 +160,8 @@ def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
     """Modes as columns over the pixels of a frame, sparse real (y x, m), each with a sum of squares of 1."""
-    w = fibrelets.mode_radius
-    reach = int(np.ceil(3 * w / pixel_size))
+    reach = int(np.ceil(3 * fibrelets.mode_radius.max() / pixel_size))
+    w = fibrelets.mode_radius[:, None]
     middle = (np.array(shape) - 1) / 2
     pixel = fibrelets.centres / pixel_size + middle
     offset = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach

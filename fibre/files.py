@@ -52,7 +52,7 @@ def load(path: str | Path, classes: tuple[type, ...] = ()) -> Any:
     >>> from fibre import Fibrelets, save
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = save(Fibrelets(np.zeros((1, 2)), 1.6e-6), Path(folder) / "fibrelets.nc")
-    ...     load(path).mode_radius
-    1.6e-06
+    ...     load(path).mode_radius.tolist()
+    [1.6e-06]
     """
     return storage.load(path, (*BELOW, *TYPES, *classes))

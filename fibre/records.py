@@ -234,15 +234,22 @@ class Recording:
 class Fibrelets:
     """Where the fibrelets are in the camera image: the basis in which fields are kept.
 
-    centres: (m, 2) metres from the middle of the frame. mode_radius: metres, 1/e radius of the field of one mode.
+    centres: (m, 2) metres from the middle of the frame. mode_radius: metres, 1/e radius of the field of each mode, (m,)
+    or one number for all.
     """
 
     centres: np.ndarray = array(("fibrelet", "row_column"), "m")
-    mode_radius: float = setting()
+    mode_radius: np.ndarray = array(("fibrelet",), "m")
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centres", real_array("centres", self.centres, shape=(None, 2), finite=True))
-        real_number("mode_radius", self.mode_radius, above=0)
+        centres = real_array("centres", self.centres, shape=(None, 2), finite=True)
+        radius = real_array("mode_radius", self.mode_radius, above=0, finite=True)
+        if radius.shape not in ((), (len(centres),)):
+            raise ValueError(
+                f"mode_radius must have shape () or ({len(centres)},) to go with centres, got {radius.shape}."
+            )
+        object.__setattr__(self, "centres", centres)
+        object.__setattr__(self, "mode_radius", np.broadcast_to(radius, len(centres)).copy())
 
 
 @dataclass(frozen=True)

@@ -65,9 +65,31 @@ def test_centres_of_separate_spots_are_sub_pixel_for_any_offset():
 
 def test_the_mode_radius_and_the_positions_in_metres_are_the_bundles(bundle, image):
     found = locate_fibrelets(image, PIXEL)
-    assert found.mode_radius == pytest.approx(bundle.mode_radius.mean(), rel=0.02)
+    assert found.mode_radius.mean() == pytest.approx(bundle.mode_radius.mean(), rel=0.02)
     distance, _ = scipy.spatial.cKDTree(bundle.centres).query(found.centres)
     assert np.median(distance) < 0.1e-6
+
+
+def test_every_fibrelet_has_its_own_radius_and_a_faint_one_keeps_the_common():
+    bundle = Bundle.hexagonal(radius=30e-6, mode_spread=0.04, rng=5)
+    generator = np.random.default_rng(6)
+    power = generator.uniform(0.5, 1.5, bundle.cores)
+    power[:3] = 1e-5
+    image = np.zeros((130, 130))
+    for core in range(bundle.cores):  # an incoherent sum: one core lit at a time
+        one = np.zeros((2, bundle.cores))
+        one[0, core] = np.sqrt(power[core])
+        image += np.abs(bundle.image(one, image.shape, PIXEL)[0]) ** 2
+    image = generator.poisson(2e4 * image / image.max()) / 2e4
+    found = locate_fibrelets(image, PIXEL)
+    distance, core = scipy.spatial.cKDTree(bundle.centres).query(found.centres)
+    ratio = found.mode_radius / bundle.mode_radius[core]
+    bright = power[core] > 0.1
+    assert distance.max() < 0.3e-6
+    assert np.std(ratio[bright]) < 0.01 < 0.03 < np.std(bundle.mode_radius / bundle.mode_radius.mean())
+    assert abs(ratio[bright].mean() - 1) < 0.005
+    faint = found.mode_radius[~bright] / np.median(found.mode_radius)
+    assert np.all(np.abs(faint - 1) < 0.05)
 
 
 def test_a_dark_or_flat_image_shows_no_lattice():
