@@ -16,7 +16,7 @@ def demo_command(folder: Path, seed: int) -> None:
     """Run the whole instrument on a simulated bench and compare with the truth; records go to FOLDER.
 
     Camera frames are simulated, merged, phase-retrieved, sent through the recovered inverse of the fibre and fitted.
-    About a minute on two cores and 120 MB of disk.
+    About a minute on two cores and 150 MB of disk.
 
     Example: polinfer demo my-demo --seed 3
     """
