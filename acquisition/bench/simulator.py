@@ -23,7 +23,7 @@ class SimulatedBench:
     """The bench of a :class:`Scene`: hologram -> sample -> bundle -> second modulator -> camera.
 
     Frames depend on (seed, step, view, exposure) only, so an interrupted run that is resumed sees the same frames.
-    ``ordering`` of the sample's elements is the phantom's (retarder first).
+    Light meets the retarder of the phantom first.
     """
 
     def __init__(self, scene: Scene, rng: int | np.random.Generator | None = None) -> None:
