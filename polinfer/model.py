@@ -257,4 +257,5 @@ def as_device(statistics: Statistics, dtype: Any) -> Statistics:
         jnp.asarray(statistics.response.astype(complex_type)),
         jnp.asarray(statistics.residual.astype(real_type)),
         jnp.asarray(statistics.constant.astype(real_type)),
+        jnp.asarray(statistics.count.astype(real_type)),
     )

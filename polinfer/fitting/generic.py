@@ -15,7 +15,7 @@ from ..degeneracy import REFERENCE, nearest, reduce_ranges
 from ..elements import multiply
 from ..model import Model, as_device
 from ..records import Fit, Measurement, Parameters, Status
-from ..statistics import Statistics, Summary, summarise
+from ..statistics import TRAILING, Statistics, Summary, summarise
 from .charts import from_parameters, to_parameters
 from .edges import integrate
 from .local_gaussian import Local, describe, equivalent, log_density, uniform_std
@@ -175,8 +175,7 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
     sigma = model.noise.sigma(measurement)
     summary = summarise(measurement, sigma)
     good = np.flatnonzero(~(summary.masked | summary.non_finite).reshape(-1))
-    trailing = Statistics(2, 2, 0, 0)
-    host = Statistics(*(_flat(x, shape, t, good) for x, t in zip(summary.statistics, trailing, strict=True)))
+    host = Statistics(*(_flat(x, shape, t, good) for x, t in zip(summary.statistics, TRAILING, strict=True)))
     earlier = None
     if start is not None:
         earlier = Parameters(*(_flat(np.asarray(x), shape, 0, good) for x in start.parameters))

@@ -5,6 +5,7 @@ import pytest
 from scipy import integrate
 
 from polinfer import ComplexGain, KnownNoise, Measurement, Model, Parameters, PhaseGain, PolariserFirst, RetarderFirst
+from polinfer.statistics import least_squares_jones, summarise
 from tests.oracles import jones as oracle
 
 X = (0.3, 0.5, 1.2, 0.4, 0.7)
@@ -53,6 +54,48 @@ def test_pixels_states_noise_and_weights_broadcast():
     for i, j in ((0, 0), (3, 2)):
         expected = oracle.log_likelihood(X, u[i, 0], v[i, j], sigma[j], weight=weight[i, 0])
         assert float(got[i, j]) == pytest.approx(expected, abs=1e-10)
+
+
+@pytest.mark.parametrize("states", [1, 2, 3, 7])
+def test_illuminations_of_their_own_in_every_pixel_give_the_direct_sum(states):
+    generator = np.random.default_rng(4)
+    u = generator.normal(size=(9, 2, states)) + 1j * generator.normal(size=(9, 2, states))
+    u[1] *= 0  # dark
+    u[2, 0] = 0  # rank 1
+    u[3, 1] = 0
+    u[4, 1] = (2 - 1j) * u[4, 0]  # linearly dependent but for rounding
+    u[5, 1] = 3 * u[5, 0] + 1e-9 * u[5, 1]  # nearly so
+    u[6, 0] = 2j * u[6, 1] + 1e-13 * u[6, 0]
+    u[7] *= [[1e-4], [1e4]]
+    v = oracle.jones(X) @ u + 0.2 * (generator.normal(size=u.shape) + 1j * generator.normal(size=u.shape)) / 2**0.5
+    weight = generator.uniform(0.1, 2, (9, states))
+    weight[8, -1] = 0
+    got = Model().log_likelihood(Parameters(*X), Measurement(u, v, 0.2, weight))
+    for i in range(9):
+        expected = oracle.log_likelihood(X, u[i], v[i], 0.2, weight=weight[i])
+        assert float(got[i]) == pytest.approx(expected, abs=1e-9, rel=1e-8), i
+    summary = summarise(Measurement(u, v, 0.2, weight), np.array(0.2))
+    alone = [summarise(Measurement(u[i], v[i], 0.2, weight[i]), np.array(0.2)) for i in range(9)]
+    assert summary.rank.tolist() == [int(one.rank) for one in alone]
+    assert summary.statistics.count.tolist() == [2.0 * states] * 8 + [2.0 * states - 2]
+    for i in (0, 2, 3, 4, 8):
+        found, expected = (least_squares_jones(s.statistics) for s in (summary, alone[i]))
+        np.testing.assert_allclose(found[i], expected, atol=1e-10)
+
+
+def test_more_pixels_than_one_block_are_each_in_their_place():
+    generator = np.random.default_rng(5)
+    shape = (3, 3001)
+    u = generator.normal(size=(2, 2)) + 0j
+    v = generator.normal(size=(*shape, 2, 2)) + 0j
+    sigma = generator.uniform(0.5, 1, shape)
+    v[2, 2500, 0, 0] = np.nan
+    for many in (u, np.broadcast_to(u, (3, 1, 2, 2)), np.broadcast_to(u, (*shape, 2, 2))):
+        got = np.asarray(Model().log_likelihood(Parameters(*X), Measurement(many, v, sigma)))
+        assert np.isnan(got).sum() == np.isnan(got[2, 2500]) == 1
+        for pixel in ((0, 0), (1, 1700), (2, 3000)):
+            expected = oracle.log_likelihood(X, u, v[pixel], sigma[pixel])
+            assert got[pixel] == pytest.approx(expected, abs=1e-10)
 
 
 @pytest.mark.parametrize("scale", [0.05, 1.0, 30.0])
