@@ -7,6 +7,7 @@ from .degeneracy import canonicalise, orbit
 from .files import load
 from .fitting import fit
 from .gain import ComplexGain, PhaseGain
+from .gauge import smooth_gauge
 from .model import Model
 from .noise import KnownNoise
 from .orderings import Ordering, PolariserFirst, RetarderFirst
@@ -43,4 +44,5 @@ __all__ = [
     "phantoms",
     "save",
     "simulate",
+    "smooth_gauge",
 ]
