@@ -7,6 +7,7 @@ from click.testing import CliRunner
 import polinfer
 from polinfer import ComplexGain, Measurement, Model, PolariserFirst, phantoms
 from polinfer.cli import main
+from tests.oracles import jones as oracle
 
 
 def run(*arguments):
@@ -31,8 +32,49 @@ def test_fit_writes_the_same_result_as_the_library_and_a_picture(measurement, tm
     np.testing.assert_array_equal(polinfer.load(out).parameters.retardance, expected.parameters.retardance)
 
 
+@pytest.mark.parametrize(
+    ("options", "states", "ordering"),
+    [
+        (["--gain", "none", "--jones"], 2, "retarder_first"),
+        (["--gain", "phase"], 3, "retarder_first"),
+        (["--gain", "complex", "--states", "5", "--ordering", "polariser_first"], 5, "polariser_first"),
+    ],
+)
+def test_simulate_writes_what_its_truth_says_and_noise_of_its_sigma(options, states, ordering, tmp_path):
+    out, truth = tmp_path / "data.nc", tmp_path / "truth.zarr"
+    result = run("simulate", out, "--shape", "7", "9", "--sigma", "0.05", "--seed", "4", "--truth", truth, *options)
+    assert result.exit_code == 0, result.output
+    assert f"7 x 9 pixels, {states} states, sigma 0.05, seed 4" in result.output
+    data, scene = polinfer.load(out), polinfer.load(truth)
+    assert data.shape == (7, 9)
+    assert (data.sigma == 0.05).all()
+    power = data.illumination @ data.illumination.conj().T
+    np.testing.assert_allclose(power, np.eye(2) * states / 2, atol=1e-12)
+    noise = np.empty_like(data.response)
+    for pixel in np.ndindex(7, 9):
+        matrix = oracle.jones([float(x[pixel]) for x in scene.parameters], ordering)
+        noise[pixel] = data.response[pixel] - scene.gain[pixel] * (matrix @ data.illumination)
+    # 63 pixels of 2 components: the mean square has a relative standard deviation of 1 / sqrt(126 states)
+    assert np.mean(abs(noise) ** 2) == pytest.approx(0.05**2, rel=5 / np.sqrt(126 * states))
+    size, phase = abs(scene.gain), np.angle(scene.gain)
+    assert (phase.std() > 0.1) == ("none" not in options)
+    assert (size.std() > 0.02) == ("complex" in options)
+    np.testing.assert_allclose(size.mean(), 0.8 if "complex" in options else 1, atol=0.1)
+
+
+def test_simulate_repeats_itself_by_seed_and_tells_a_drawn_one(tmp_path):
+    first, again, other = (tmp_path / f"{name}.nc" for name in ("first", "again", "other"))
+    told = run("simulate", first, "--shape", "2", "3").output.split()[-1]
+    for path, seed in ((again, told), (other, str(int(told) + 1))):
+        assert run("simulate", path, "--shape", "2", "3", "--seed", seed).exit_code == 0
+    response = [polinfer.load(path).response for path in (first, again, other)]
+    np.testing.assert_array_equal(response[0], response[1])
+    assert np.all(response[0] != response[2])
+
+
 def test_help_and_version_are_there_with_an_example():
-    assert "Example: polinfer fit" in run("fit", "--help").output
+    for command in ("fit", "simulate"):
+        assert f"Example: polinfer {command}" in run(command, "--help").output
     assert "fit" in run("--help").output
     assert "0." in run("--version").output
 
@@ -54,6 +96,13 @@ def test_mistakes_end_in_one_line_and_exit_code_2(measurement, tmp_path):
         (("fit", measurement, out, "--gain", "complex", "--gain-scale", "-1"), "scale must be > 0"),
         (("fit", measurement, out, "--gain", "some"), "Invalid value for '--gain'"),
         (("fly",), "No such command"),
+        (("simulate", out, "--sigma", "0"), "sigma must be > 0"),
+        (("simulate", out, "--shape", "0", "3"), "Invalid value for '--shape'"),
+        (("simulate", out, "--jones", "--states", "3"), "leave out --states"),
+        (("simulate", out, "--truth", out), "is OUT"),
+        (("simulate", measurement), "exists"),
+        (("simulate", out, "--truth", measurement), "exists"),
+        (("simulate", tmp_path / "out.txt"), "must end in .nc"),
     ]
     for arguments, text in cases:
         result = run(*arguments)

@@ -1,0 +1,54 @@
+"""The command ``polinfer fit``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .options import PATH, declared_model, model_options, overwrite_option, vacant
+
+__all__ = ["fit_command"]
+
+
+@click.command("fit")
+@click.argument("measurement", type=PATH)
+@click.argument("out", type=PATH)
+@model_options
+@click.option("--picture", type=PATH, help="Also draw the maps into this file (.png, .pdf, .svg).")
+@overwrite_option
+@click.option("--progress/--no-progress", default=True, show_default=True, help="Show a progress bar.")
+def fit_command(
+    measurement: Path, out: Path, picture: Path | None, overwrite: bool, progress: bool, **declared: Any
+) -> None:
+    """Fit the five parameters of every pixel of MEASUREMENT and write the result to OUT (.nc or .zarr).
+
+    Example: polinfer fit measurement.nc result.nc --gain complex --gain-scale 1.0 --picture map.png
+    """
+    import numpy as np
+
+    from .. import files, storage
+    from ..fitting import fit
+    from ..records import Measurement, Parameters, Status
+
+    model = declared_model(**declared)
+    vacant(out, overwrite)
+    data = files.load(measurement)
+    if not isinstance(data, Measurement):
+        raise click.UsageError(f"{measurement} holds a {type(data).__name__}, not a Measurement.")
+    result = fit(model, data, progress=progress)
+    storage.save(result, out, overwrite=overwrite)
+    if picture is not None:
+        result.plot().savefig(picture)
+    click.echo(f"{result.status.size} pixels, {int(np.sum(result.status == 0))} OK")
+    for flag in Status:
+        count = int(np.sum((result.status & int(flag)) != 0))
+        if count:
+            click.echo(f"  {flag.name}: {count}")
+    for name in Parameters._fields:
+        values, widths = getattr(result.parameters, name), getattr(result.std, name)
+        if np.isfinite(widths).any():
+            scale, unit = (1.0, "") if name == "diattenuation" else (180 / np.pi, " degrees")
+            middle, width = (scale * float(np.nanmedian(x)) for x in (values, widths))
+            click.echo(f"  {name}: median {middle:.4g}, median standard deviation {width:.2g}{unit}")
