@@ -1,6 +1,6 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import datasets, phantoms
+from . import conventions, datasets, phantoms
 from .bounds import cramer_rao_bound
 from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
@@ -34,6 +34,7 @@ __all__ = [
     "UniformAngle",
     "VonMises",
     "canonicalise",
+    "conventions",
     "cramer_rao_bound",
     "datasets",
     "decompose",
