@@ -371,8 +371,9 @@ def test_depolarisation_is_refused_with_its_distance():
     taken = conventions.from_katsu(mixed, tolerance=distance * 1.001)
     np.testing.assert_allclose(taken, np.sqrt(1 - p) * np.eye(2), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(mixed - conventions.to_katsu(taken)) / np.linalg.norm(mixed), distance)
-    with pytest.raises(ValueError, match="distance of 1 "):
-        conventions.from_katsu(-np.eye(4))
+    for unphysical in (-np.eye(4), np.diag([-1.0, 0, 0, 0])):  # no positive eigenvalue: nothing is nearer than 0
+        with pytest.raises(ValueError, match="distance of 1 "):
+            conventions.from_katsu(unphysical)
 
 
 def test_the_nearest_pure_matrix_is_taken():
