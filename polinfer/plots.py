@@ -1,86 +1,198 @@
-"""Pictures of results. Angles are shown in degrees."""
+"""Pictures of results. Angles are shown in degrees, lengths in micrometres."""
 
 from __future__ import annotations
 
+from math import floor, log10, pi
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .checks import one_of_types
+from .checks import one_of_types, real_number
+from .gauge import smooth_gauge
 from .records import PERIODS, Fit, Parameters, Status
 
 if TYPE_CHECKING:
+    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-__all__ = ["plot_fit"]
+__all__ = ["colour_circle", "plot_fit"]
 
 TITLES = Parameters(
     "diattenuation", "diattenuation angle (°)", "retardance (°)", "retardance angle (°)", "circularity (°)"
 )
 _NO_ANSWER = int(Status.MASKED | Status.NON_FINITE | Status.NOT_CONVERGED)
+_GREY = "0.8"
+_HATCHED: dict[str, Any] = {"facecolor": "0.93", "edgecolor": "0.45", "hatch": "//////"}
 
 
-def _draw(figure: Any, axes: Any, title: str, values: np.ndarray, cyclic: float | None, **limits: float) -> None:
-    """One map with its colour bar; ``cyclic`` is the period in the unit of the values."""
+def colour_circle() -> ListedColormap:
+    """Colours for angles: 256 hues in even steps, the last beside the first.
+
+    ``L = 0.71 + 0.1 cos(h - 3)``, ``C = 0.13`` in OKLCH, with the hue h once round from end to end. No grey occurs in
+    it, so that grey can stand for "unknown"; the lightness helps those who see hues badly.
+
+    Source: B. Ottosson, "A perceptual color space for image processing", 2020 (OKLab).
+
+    >>> colours = colour_circle()
+    >>> bool(np.abs(np.subtract(colours(0.0), colours(1.0))).max() < 0.03)
+    True
+    """
+    from matplotlib.colors import ListedColormap
+
+    hue = 2 * pi * np.arange(256) / 256 + pi + 0.5
+    lightness, chroma = 0.71 + 0.1 * np.cos(hue - 3), 0.13
+    a, b = chroma * np.cos(hue), chroma * np.sin(hue)
+    cones = np.stack([
+        lightness + 0.3963377774 * a + 0.2158037573 * b,
+        lightness - 0.1055613458 * a - 0.0638541728 * b,
+        lightness - 0.0894841775 * a - 1.2914855480 * b,
+    ]) ** 3  # fmt: skip
+    linear = np.array([
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]) @ cones  # fmt: skip
+    display = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return ListedColormap(np.clip(display, 0, 1).T, name="colour_circle")
+
+
+def _image(values: Any) -> np.ndarray:
+    """Any pixel shape as one image, frames below each other."""
+    array = np.asarray(values)
+    return array.reshape(-1, array.shape[-1] if array.ndim else 1)
+
+
+def _scale_bar(axes: Any, columns: int, pixel_size: float) -> None:
+    """A bar below the map: 1, 2 or 5 times a power of ten, at most a third of the width, if there is one so short."""
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
+    limit = columns * pixel_size / 3 * 1e6
+    power = 10.0 ** floor(log10(limit))
+    length = next(n * power for n in (5, 2, 1) if n * power <= limit * (1 + 1e-9))
+    bar = AnchoredSizeBar(
+        axes.transData, length * 1e-6 / pixel_size, f"{length:g} µm", loc="upper right", pad=0.2, sep=2, frameon=False,
+        bbox_to_anchor=(1.0, -0.01), bbox_transform=axes.transAxes, borderpad=0, fontproperties={"size": 7},
+    )  # fmt: skip
+    axes.add_artist(bar)
+
+
+def _draw(
+    axes: Any,
+    title: str,
+    values: np.ndarray,
+    lost: np.ndarray,
+    period: float | None = None,
+    high: float | None = None,
+    unknown: np.ndarray | None = None,
+    pixel_size: float | None = None,
+) -> None:
+    """One map with its colour bar.
+
+    ``period`` in the unit of the values makes it a circle. ``high``: a scale from 0, at most to there, that leaves the
+    largest 2 % of the values to the colour of its end. Hatched where lost, grey where unknown.
+    """
     import matplotlib
 
-    image = np.atleast_1d(values).reshape(-1, np.shape(values)[-1] if np.ndim(values) else 1)
-    colours = matplotlib.colormaps["viridis" if cyclic is None else "twilight"].with_extremes(bad="0.7")
-    if cyclic is not None:
-        limits = {"vmin": -0.5 * cyclic, "vmax": 0.5 * cyclic}
-    elif not np.isfinite(image).any():
-        limits = {"vmin": 0.0, "vmax": 1.0}
-    shown = axes.imshow(np.ma.masked_invalid(image), cmap=colours, interpolation="nearest", **limits)
+    grey = np.zeros(np.shape(lost), bool) if unknown is None else unknown
+    image = np.ma.masked_invalid(np.where(_image(lost | grey), np.nan, _image(values)))
+    shown, extend = image.compressed(), "neither"
+    low, top = (float(shown.min()), float(shown.max())) if shown.size else (0.0, 1.0)
+    if period is not None:
+        colours, limits = colour_circle(), (-0.5 * period, 0.5 * period)
+    elif high is not None:
+        end = min(float(np.percentile(shown, 98)), high) if shown.size else 1.0
+        colours, limits, extend = matplotlib.colormaps["viridis"], (0.0, end or 1.0), "max" if top > end else "neither"
+    elif title == TITLES.diattenuation and low < 0:
+        colours, limits = matplotlib.colormaps["PuOr_r"], (-max(top, -low), max(top, -low))
+    else:
+        colours, limits = matplotlib.colormaps["viridis"], (low, top)
+    long = max(image.shape) > 6 * min(image.shape)
+    axes.set_facecolor(_HATCHED["facecolor"])
+    axes.patch.set(hatch=_HATCHED["hatch"], edgecolor=_HATCHED["edgecolor"], linewidth=0)
+    drawn = axes.imshow(
+        image, cmap=colours, interpolation="nearest", vmin=limits[0], vmax=limits[1], aspect="auto" if long else "equal"
+    )
+    if grey.any():
+        cover = np.ma.masked_where(~_image(grey), np.zeros(image.shape))
+        axes.imshow(
+            cover, cmap=matplotlib.colors.ListedColormap([_GREY]), interpolation="nearest", aspect=axes.get_aspect()
+        )
     axes.set_title(title, fontsize=9)
     axes.set_xticks([])
     axes.set_yticks([])
-    bar = figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.03)
+    ticks = None if period is None else np.linspace(-0.5, 0.5, 5) * period
+    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03, extend=extend, ticks=ticks)
     bar.ax.tick_params(labelsize=7)
+    if pixel_size is not None and not (long and image.shape[0] > image.shape[1]):
+        _scale_bar(axes, image.shape[1], pixel_size)
 
 
-def plot_fit(fit: Fit) -> Figure:
-    """Maps of a fit: each parameter above its standard deviation, after amplitude and phase of a gain.
+def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) -> Figure:
+    """Maps of a fit: each parameter above its standard deviation, beside reduced chi-square and evidence.
 
-    Angles are in degrees with a colour scale that closes on itself over their period; a retardance without a free gain
-    has real ends, but is shown on the same circle. Grey pixels have no answer: they are masked, not finite, not
-    converged, or (upper row) the parameter is not identified there. Below the gain stand the reduced chi-square
-    and the evidence.
+    Angles are in degrees, in colours that close on themselves over their period (:func:`colour_circle`); a retardance
+    without a free gain has real ends, but is shown on the same circle. D has a scale with 0 in its middle where it is
+    negative somewhere. A scale of standard deviations begins at 0 and ends at the 98th percentile, or at the width of
+    a uniform distribution; a pointed end says that larger values have its colour. Hatched pixels have no answer
+    (masked, not finite or not converged); in grey ones the parameter is not identified.
 
     Parameters
     ----------
-    fit: of any pixel shape; a single pixel or a row is shown as an image.
+    fit: of any pixel shape; a single pixel or a row is shown as an image, frames stand below each other.
+    smooth: show the equivalent parameters that :func:`polinfer.smooth_gauge` chooses instead of those of the fit.
+    pixel_size: side of a pixel, metres, > 0, for a scale bar below every map; None: no bar. Frames more than six times
+        as long as wide are stretched, and columns have no bar.
+
+    Raises
+    ------
+    TypeError, ValueError: not a fit, a pixel size out of range.
 
     >>> import polinfer
     >>> scene = polinfer.phantoms.lesion((4, 4), rng=1)
     >>> data = polinfer.simulate(polinfer.Model(), scene.parameters, np.eye(2), sigma=0.05, rng=1)
-    >>> len(plot_fit(polinfer.fit(polinfer.Model(), data)).axes)
-    20
+    >>> figure = plot_fit(polinfer.fit(polinfer.Model(), data), pixel_size=9e-6)
+    >>> [axes.get_title() for axes in figure.axes][:2]
+    ['χ² / degrees of freedom', 'diattenuation']
     """
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     one_of_types("fit", fit, (Fit,), "pass the result of fit().")
+    if pixel_size is not None:
+        pixel_size = real_number("pixel_size", pixel_size, above=0)
     status = np.asarray(fit.status)
     lost = (status & _NO_ANSWER) != 0
-    rows, columns = status.shape[-2:] if status.ndim >= 2 else (1, status.size)
-    height = min(max(2.2 * rows / columns, 0.7), 4.0)
-    extra = 0 if fit.gain is None else 2
-    figure = Figure(figsize=(2.9 * (5 + extra), 2 * (height + 0.5)), layout="constrained")
+    rows, columns = _image(status).shape
+    height = min(max(2.2 * rows / columns, 0.7), 3.0)
+    extra = 1 if fit.gain is None else 2
+    figure = Figure(figsize=(2.9 * (5 + extra), 2 * (height + (0.5 if pixel_size is None else 0.7)) + 0.2),
+                    layout="constrained")  # fmt: skip
     axes = figure.subplots(2, 5 + extra, squeeze=False)
+    quality = axes[1] if fit.gain is not None else axes[:, 0]
     if fit.gain is not None:
-        _draw(figure, axes[0, 0], "amplitude", np.where(lost, np.nan, np.abs(fit.gain)), None)
-        _draw(figure, axes[0, 1], "phase (°)", np.where(lost, np.nan, np.degrees(np.angle(fit.gain))), 360.0)
-        _draw(figure, axes[1, 0], "χ² / degrees of freedom",
-              np.where(lost | (fit.degrees_of_freedom == 0), np.nan,
-                       fit.chi_square / np.maximum(fit.degrees_of_freedom, 1)), None)  # fmt: skip
-        _draw(figure, axes[1, 1], "log evidence (nat)", np.where(lost, np.nan, fit.log_evidence), None)
+        _draw(axes[0, 0], "amplitude", np.abs(fit.gain), lost, pixel_size=pixel_size)
+        _draw(axes[0, 1], "phase (°)", np.degrees(np.angle(fit.gain)), lost, period=360.0, pixel_size=pixel_size)
+    freedom = np.asarray(fit.degrees_of_freedom)
+    _draw(quality[0], "χ² / degrees of freedom", fit.chi_square / np.maximum(freedom, 1), lost | (freedom == 0),
+          high=np.inf, pixel_size=pixel_size)  # fmt: skip
+    _draw(quality[1], "log evidence (nat)", fit.log_evidence, lost, pixel_size=pixel_size)
+    parameters = smooth_gauge(fit.parameters, status) if smooth else fit.parameters
+    grey = False
     for i, name in enumerate(Parameters._fields):
         unit = 1.0 if name == "diattenuation" else 180 / np.pi
-        value, std = unit * np.asarray(getattr(fit.parameters, name)), unit * np.asarray(getattr(fit.std, name))
-        unknown = lost | ((status & int(Status.unidentified(name))) != 0)
-        cyclic = None if name == "diattenuation" else unit * getattr(PERIODS, name)
-        _draw(figure, axes[0, extra + i], getattr(TITLES, name), np.where(unknown, np.nan, value), cyclic)
+        value, std = unit * np.asarray(getattr(parameters, name)), unit * np.asarray(getattr(fit.std, name))
+        unknown = ~lost & ((status & int(Status.unidentified(name))) != 0)
+        grey = grey or bool(np.any(unknown))
+        period = None if name == "diattenuation" else unit * getattr(PERIODS, name)
+        _draw(axes[0, extra + i], getattr(TITLES, name), value, lost, period, unknown=unknown, pixel_size=pixel_size)
         # a width beyond that of a uniform distribution says no more than "unknown" and would hide all others
-        ceiling = 2 / 12**0.5 if cyclic is None else cyclic / 12**0.5
-        spread = np.where(lost, np.nan, np.minimum(std, ceiling))
-        _draw(figure, axes[1, extra + i], "± standard deviation", spread, None, vmin=0.0)
+        ceiling = (2 if period is None else period) / 12**0.5
+        title = "± standard deviation" if period is None else "± standard deviation (°)"
+        dropped = ~lost & np.isnan(std)
+        _draw(axes[1, extra + i], title, std, lost, high=ceiling, unknown=dropped, pixel_size=pixel_size)
+    handles = [Patch(facecolor=_GREY, label="not identified")] if grey else []
+    handles += [Patch(**_HATCHED, linewidth=0, label="no answer")] if lost.any() else []
+    handles += [Patch(alpha=0, label="smooth gauge")] if smooth else []
+    if handles:
+        figure.legend(handles=handles, loc="outside lower right", ncols=3, fontsize=8, frameon=False, borderpad=0)
     return figure
