@@ -64,7 +64,7 @@ def _image(values: Any) -> np.ndarray:
 
 def _scale_bar(axes: Any, columns: int, pixel_size: float) -> None:
     """A bar below the map: 1, 2 or 5 times a power of ten, at most a third of the width, if there is one so short."""
-    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
 
     limit = columns * pixel_size / 3 * 1e6
     power = 10.0 ** floor(log10(limit))
@@ -93,6 +93,7 @@ def _draw(
     """
     import matplotlib
 
+    colours: Any
     grey = np.zeros(np.shape(lost), bool) if unknown is None else unknown
     image = np.ma.masked_invalid(np.where(_image(lost | grey), np.nan, _image(values)))
     shown, extend = image.compressed(), "neither"
