@@ -102,15 +102,62 @@ def test_on_the_whole_the_gauge_is_the_one_nearest_to_the_reference():
     np.testing.assert_array_equal(found.retardance, canonical.retardance)
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-np.pi / 2, np.pi / 2)), min_size=2, max_size=2))
+def test_two_polarisers_are_as_near_as_the_canonical_distance_allows(pixels):
+    (d, t), (e, u) = pixels
+    found = smooth_gauge(Parameters(np.array([d, e]), np.array([t, u]), 1.0, 0.4, 0.2))
+
+    def square(d, t, e, u):
+        return (d - e) ** 2 + np.angle(np.exp(2j * (t - u))) ** 2
+
+    least = min(square(d, t, e, u), square(d, t, -e, u + np.pi / 2))
+    x, y = found.diattenuation, found.diattenuation_angle
+    assert square(x[0], y[0], x[1], y[1]) == pytest.approx(least, abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(*(st.floats(-h, h) for h in (np.pi, np.pi / 2, np.pi))), min_size=2, max_size=2))
+def test_two_retarders_are_as_near_as_their_axes_on_the_sphere_allow(pixels):
+    given = [np.array(values) for values in zip(*pixels, strict=True)]
+    found = smooth_gauge(Parameters(0.1, 0.2, *given))
+
+    def pair(eta, t, xi):
+        axis = np.stack([np.cos(2 * t), np.sin(2 * t) * np.cos(xi), np.sin(2 * t) * np.sin(xi)])
+        return eta, axis
+
+    def square(eta, axis):
+        angle = 2 * np.arcsin(np.clip(np.linalg.norm(axis[:, 0] - axis[:, 1]) / 2, 0, 1))
+        return angle**2 + np.angle(np.exp(1j * (eta[0] - eta[1]))) ** 2
+
+    eta, axis = pair(*given)
+    least = min(square(sign * eta, sign * axis) for sign in (np.ones(2), np.array([1, -1])))
+    assert square(*pair(*found[2:])) == pytest.approx(least, abs=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_of_two_equally_near_gauges_the_first_pixel_decides(seed):
+    # with the axis at 0 or 90 degrees, and as much of D on either side, both are equally near to the reference
+    rng = np.random.default_rng(seed)
+    d = rng.uniform(-0.5, 0.5, 8)
+    d -= d.mean()
+    found = smooth_gauge(Parameters(d, 0.0, 1.0, 0.4, 0.2))
+    np.testing.assert_array_equal(found.diattenuation, d * np.sign(d[0]))
+
+
 def test_gaps_are_gone_round_and_islands_stand_for_themselves():
     truth = scene(11, (40, 30))
     rng = np.random.default_rng(0)
     hole = rng.random((40, 30)) < 0.2
     hole[20] = True
-    given = Parameters(*(np.where(hole, np.nan, x) for x in mixed(truth, rng)))
+    given = mixed(truth, rng)
+    axis, xi = (np.where(hole, np.nan, x) for x in (given.diattenuation_angle, given.circularity))
+    given = given._replace(diattenuation_angle=axis, circularity=xi)
     found = smooth_gauge(given)
-    for values in found:
-        np.testing.assert_array_equal(np.isnan(values), hole)
+    for values, came in zip(found, given, strict=True):
+        np.testing.assert_array_equal(values[hole], came[hole])
+        assert not np.isnan(values[~hole]).any()
     from scipy.ndimage import label
 
     islands, count = label(~hole)
@@ -145,6 +192,9 @@ def test_a_polariser_without_axis_stays_and_the_retarder_is_still_smooth():
     )
     np.testing.assert_array_equal(found.diattenuation, eta)
     np.testing.assert_allclose(found.retardance, eta, atol=1e-12)
+    d, axis = np.array([0.05, -0.3, -0.4, 0.2]), np.array([0.1, 0.1, 0.1, np.nan])
+    last = smooth_gauge(Parameters(d, axis, 1.0, 0.7, 0.1)).diattenuation[-1]
+    assert last == 0.2
     pure = smooth_gauge(truth._replace(circularity=np.nan, diattenuation=0.0))
     np.testing.assert_array_equal(pure.retardance, eta)
 
