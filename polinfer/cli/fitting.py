@@ -17,30 +17,56 @@ __all__ = ["fit_command"]
 @click.argument("out", type=PATH)
 @model_options
 @click.option("--picture", type=PATH, help="Also draw the maps into this file (.png, .pdf, .svg).")
+@click.option(
+    "--smooth-gauge/--reference-gauge",
+    "smooth",
+    default=None,
+    show_default="reference",
+    help="Which of the equivalent parameters the picture shows: smooth maps, or what OUT holds.",
+)
+@click.option("--pixel-size", type=float, help="Side of a pixel in micrometres, for a scale bar in the picture.")
 @overwrite_option
 @click.option("--progress/--no-progress", default=True, show_default=True, help="Show a progress bar.")
 def fit_command(
-    measurement: Path, out: Path, picture: Path | None, overwrite: bool, progress: bool, **declared: Any
+    measurement: Path,
+    out: Path,
+    picture: Path | None,
+    smooth: bool | None,
+    pixel_size: float | None,
+    overwrite: bool,
+    progress: bool,
+    **declared: Any,
 ) -> None:
     """Fit the five parameters of every pixel of MEASUREMENT and write the result to OUT (.nc or .zarr).
 
     Example: polinfer fit measurement.nc result.nc --gain complex --gain-scale 1.0 --picture map.png
+
+    Example: polinfer fit measurement.nc result.nc --window 3 5 --fix diattenuation=0
     """
+    from dataclasses import replace
+
     import numpy as np
 
     from .. import files, storage
     from ..fitting import fit
+    from ..plots import plot_fit
     from ..records import Measurement, Parameters, Status
 
+    if picture is None and (smooth is not None or pixel_size is not None):
+        raise click.UsageError("the gauge and --pixel-size are only for --picture.")
     model = declared_model(**declared)
     vacant(out, overwrite)
     data = files.load(measurement)
     if not isinstance(data, Measurement):
         raise click.UsageError(f"{measurement} holds a {type(data).__name__}, not a Measurement.")
+    if declared["infer_noise"] is not None and data.sigma is not None:
+        click.echo("the sigma of the measurement is not used: --infer-noise")
+        data = replace(data, sigma=None)
     result = fit(model, data, progress=progress)
     storage.save(result, out, overwrite=overwrite)
     if picture is not None:
-        result.plot().savefig(picture)
+        size = None if pixel_size is None else pixel_size * 1e-6
+        plot_fit(result, smooth=bool(smooth), pixel_size=size).savefig(picture)
     click.echo(f"{result.status.size} pixels, {int(np.sum(result.status == 0))} OK")
     for flag in Status:
         count = int(np.sum((result.status & int(flag)) != 0))
@@ -52,3 +78,5 @@ def fit_command(
             scale, unit = (1.0, "") if name == "diattenuation" else (180 / np.pi, " degrees")
             middle, width = (scale * float(np.nanmedian(x)) for x in (values, widths))
             click.echo(f"  {name}: median {middle:.4g}, median standard deviation {width:.2g}{unit}")
+    if declared["infer_noise"] is not None and np.isfinite(result.sigma).any():
+        click.echo(f"  sigma: median {float(np.nanmedian(result.sigma)):.4g}")

@@ -35,6 +35,28 @@ _MODEL = (
         help="Unknown complex factor of every pixel.",
     ),
     click.option("--gain-scale", type=float, help="Root mean square amplitude of a complex gain; needed with it."),
+    click.option(
+        "--window",
+        nargs=2,
+        type=int,
+        metavar="ROWS COLUMNS",
+        help="The pixels of such a window share their parameters; odd numbers.",
+    ),
+    click.option(
+        "--infer-noise",
+        type=click.Choice(["pixel", "frame"]),
+        help="The noise is unknown, one sigma a pixel or a frame; a sigma in the file is not used.",
+    ),
+    click.option(
+        "--noise-shape", type=float, help="Inverse gamma prior of sigma^2: shape, half the real data it is worth."
+    ),
+    click.option("--noise-scale", type=float, help="Inverse gamma prior of sigma^2: scale, about shape times sigma^2."),
+    click.option(
+        "--fix",
+        multiple=True,
+        metavar="NAME=VALUE",
+        help="A known parameter, such as diattenuation=0 or retardance_angle=30 (degrees). Repeatable.",
+    ),
 )
 
 
@@ -52,21 +74,72 @@ def named_ordering(name: str) -> Ordering:
     return RetarderFirst() if name == "retarder_first" else PolariserFirst()
 
 
-def declared_model(ordering: str, gain: str, gain_scale: float | None) -> Model:
+def _known_values(fix: tuple[str, ...]) -> dict[str, float]:
+    """Values by name, angles in radians."""
+    from math import degrees, radians
+
+    from ..records import RANGES, Parameters
+
+    known: dict[str, float] = {}
+    for text in fix:
+        name, _, number = text.partition("=")
+        if name not in Parameters._fields:
+            raise click.UsageError(f"--fix {text}: the parameters are {', '.join(Parameters._fields)}.")
+        if name in known:
+            raise click.UsageError(f"--fix names {name} twice.")
+        try:
+            value = float(number)
+        except ValueError:
+            raise click.UsageError(
+                f"--fix {text}: {number!r} is no number; write {name}=0.5, angles in degrees."
+            ) from None
+        low, high = getattr(RANGES, name)
+        low, high, unit = (low, high, "") if name == "diattenuation" else (degrees(low), degrees(high), " degrees")
+        if not low <= value <= high:
+            raise click.UsageError(f"--fix {text}: {name} must be from {low:g} to {high:g}{unit}.")
+        known[name] = value if name == "diattenuation" else radians(value)
+    return known
+
+
+def declared_model(
+    ordering: str,
+    gain: str,
+    gain_scale: float | None,
+    window: tuple[int, int] | None,
+    infer_noise: str | None,
+    noise_shape: float | None,
+    noise_scale: float | None,
+    fix: tuple[str, ...],
+) -> Model:
     """The model that the options of :func:`model_options` declare."""
     from ..gain import ComplexGain, Gain, PhaseGain
     from ..model import Model
 
-    chosen: Gain | None = None
+    factor: Gain | None = None
     if gain == "complex":
         if gain_scale is None:
             raise click.UsageError("--gain complex needs --gain-scale: the root mean square amplitude of the gain.")
-        chosen = ComplexGain(gain_scale)
+        factor = ComplexGain(gain_scale)
     elif gain_scale is not None:
         raise click.UsageError("--gain-scale is only for --gain complex.")
     elif gain == "phase":
-        chosen = PhaseGain()
-    return Model(named_ordering(ordering), gain=chosen)
+        factor = PhaseGain()
+    parts: dict[str, Any] = {}
+    if infer_noise is not None:
+        if noise_shape is None or noise_scale is None:
+            raise click.UsageError(
+                "--infer-noise needs --noise-shape and --noise-scale: a prior of sigma^2 about scale / shape."
+            )
+        from ..noise import InferredNoise
+
+        parts["noise"] = InferredNoise(noise_shape, noise_scale, infer_noise)
+    elif noise_shape is not None or noise_scale is not None:
+        raise click.UsageError("--noise-shape and --noise-scale are only for --infer-noise.")
+    if window is not None:
+        from .. import Window
+
+        parts["neighbours"] = Window(*window)
+    return Model(named_ordering(ordering), gain=factor, fixed=_known_values(fix), **parts)
 
 
 def vacant(path: Path, overwrite: bool) -> None:

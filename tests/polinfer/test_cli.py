@@ -24,12 +24,46 @@ def measurement(tmp_path):
 def test_fit_writes_the_same_result_as_the_library_and_a_picture(measurement, tmp_path):
     out, picture = tmp_path / "fit.nc", tmp_path / "map.png"
     result = run("fit", measurement, out, "--ordering", "polariser_first", "--gain", "complex", "--gain-scale", "1.0",
-                 "--picture", picture, "--no-progress")  # fmt: skip
+                 "--picture", picture, "--smooth-gauge", "--pixel-size", "9", "--no-progress")  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "20 pixels" in result.output
     assert picture.read_bytes()[:4] == b"\x89PNG"
     expected = polinfer.fit(Model(PolariserFirst(), gain=ComplexGain(1.0)), polinfer.load(measurement))
     np.testing.assert_array_equal(polinfer.load(out).parameters.retardance, expected.parameters.retardance)
+
+
+def declared(monkeypatch, measurement, out, *options):
+    """The model and the data that the command hands to ``fit``; nothing is fitted."""
+    seen = []
+
+    def stand_in(model, data, progress):
+        seen.extend([model, data])
+        raise ValueError("enough")
+
+    monkeypatch.setattr("polinfer.fitting.fit", stand_in)
+    result = run("fit", measurement, out, *options)
+    assert "enough" in result.output, result.output
+    return seen
+
+
+def test_options_declare_the_model_in_degrees_and_fit_gets_it(monkeypatch, measurement, tmp_path):
+    out = tmp_path / "out.nc"
+    model, data = declared(monkeypatch, measurement, out, "--gain", "phase", "--window", "3", "5", "--fix",
+                           "diattenuation=0.25", "--fix", "retardance_angle=-30")  # fmt: skip
+    expected = Model(
+        gain=polinfer.PhaseGain(),
+        neighbours=polinfer.Window(3, 5),
+        fixed={"diattenuation": 0.25, "retardance_angle": -np.pi / 6},
+    )
+    assert model == expected
+    assert data.sigma is not None
+    model, _ = declared(monkeypatch, measurement, out, "--fix", "retardance=180", "--ordering", "polariser_first")
+    assert model == Model(PolariserFirst(), fixed={"retardance": np.pi})
+    noise = ("--infer-noise", "frame", "--noise-shape", "2", "--noise-scale", "0.002")
+    model, data = declared(monkeypatch, measurement, out, *noise)
+    assert model == Model(noise=polinfer.InferredNoise(2.0, 0.002, "frame"))
+    assert data.sigma is None
+    assert "sigma of the measurement is not used" in run("fit", measurement, out, *noise).output
 
 
 @pytest.mark.parametrize(
@@ -94,6 +128,16 @@ def test_mistakes_end_in_one_line_and_exit_code_2(measurement, tmp_path):
         (("fit", measurement, measurement), "exists"),
         (("fit", measurement, out, "--gain", "complex"), "needs --gain-scale"),
         (("fit", measurement, out, "--gain", "complex", "--gain-scale", "-1"), "scale must be > 0"),
+        (("fit", measurement, out, "--gain-scale", "1"), "only for --gain complex"),
+        (("fit", measurement, out, "--fix", "retardance=270"), "must be from -180 to 180 degrees"),
+        (("fit", measurement, out, "--fix", "diattenuation=2"), "must be from -1 to 1."),
+        (("fit", measurement, out, "--fix", "size=1"), "the parameters are diattenuation,"),
+        (("fit", measurement, out, "--fix", "retardance"), "is no number"),
+        (("fit", measurement, out, "--fix", "retardance=1", "--fix", "retardance=2"), "twice"),
+        (("fit", measurement, out, "--infer-noise", "pixel"), "needs --noise-shape and --noise-scale"),
+        (("fit", measurement, out, "--noise-shape", "2"), "only for --infer-noise"),
+        (("fit", measurement, out, "--window", "0", "3"), "must be"),
+        (("fit", measurement, out, "--smooth-gauge"), "only for --picture"),
         (("fit", measurement, out, "--gain", "some"), "Invalid value for '--gain'"),
         (("fly",), "No such command"),
         (("simulate", out, "--sigma", "0"), "sigma must be > 0"),
