@@ -9,7 +9,8 @@ from .fitting import fit
 from .gain import ComplexGain, PhaseGain
 from .gauge import smooth_gauge
 from .model import Model
-from .noise import KnownNoise
+from .neighbours import Window
+from .noise import InferredNoise, KnownNoise
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .priors import AxialVonMises, Prior, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters, Status
@@ -20,6 +21,7 @@ __all__ = [
     "AxialVonMises",
     "ComplexGain",
     "Fit",
+    "InferredNoise",
     "KnownNoise",
     "Measurement",
     "Model",
@@ -33,6 +35,7 @@ __all__ = [
     "TruncatedNormal",
     "UniformAngle",
     "VonMises",
+    "Window",
     "canonicalise",
     "conventions",
     "cramer_rao_bound",

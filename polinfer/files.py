@@ -9,7 +9,8 @@ from . import storage
 from .datasets import FibreMatrix
 from .gain import ComplexGain, PhaseGain
 from .model import Model
-from .noise import KnownNoise
+from .neighbours import Window
+from .noise import InferredNoise, KnownNoise
 from .orderings import PolariserFirst, RetarderFirst
 from .phantoms import Phantom
 from .priors import AxialVonMises, TruncatedNormal, UniformAngle, VonMises
@@ -21,7 +22,7 @@ TYPES: tuple[type, ...] = (
     Measurement, Fit, Phantom, FibreMatrix, Parameters, Model,
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
-    KnownNoise, PhaseGain, ComplexGain,
+    KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,
 )  # fmt: skip
 
 

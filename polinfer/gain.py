@@ -16,6 +16,7 @@ import numpy as np
 
 from .checks import real_number
 from .circular import bessel_ratio, log_scaled_bessel
+from .power_means import log_gain_mean, log_phase_mean
 
 __all__ = ["ComplexGain", "Gain", "PhaseGain", "UnitGain"]
 
@@ -47,6 +48,10 @@ class Gain(ABC):
         """Log of the integral of ``exp(-|g M - Y|^2) p(g)`` over g."""
 
     @abstractmethod
+    def log_power_mean(self, model: jax.Array, data: jax.Array, rest: jax.Array, power: jax.Array) -> jax.Array:
+        """Log of the integral of ``(1 + rest + |g M - Y|^2)^-power p(g)`` over g: what unknown noise asks for."""
+
+    @abstractmethod
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         """Independent complex draws from the prior."""
 
@@ -70,6 +75,9 @@ class UnitGain(Gain):
 
     def log_marginal(self, model: jax.Array, data: jax.Array) -> jax.Array:
         return -_square(model - data)
+
+    def log_power_mean(self, model: jax.Array, data: jax.Array, rest: jax.Array, power: jax.Array) -> jax.Array:
+        return -power * jnp.log1p(rest + _square(model - data))
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:  # noqa: ARG002
         return np.ones(shape, complex)
@@ -108,6 +116,11 @@ class PhaseGain(Gain):
         phase, size = self._overlap(model, data)
         return -_square(phase[..., None, None] * model - data) + log_scaled_bessel(2 * size)
 
+    def log_power_mean(self, model: jax.Array, data: jax.Array, rest: jax.Array, power: jax.Array) -> jax.Array:
+        phase, size = self._overlap(model, data)
+        least = rest + _square(phase[..., None, None] * model - data)
+        return log_phase_mean(power, 4 * size / (1 + least)) - power * jnp.log1p(least)
+
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         return np.asarray(np.exp(2j * np.pi * rng.uniform(size=shape)))
 
@@ -145,6 +158,15 @@ class ComplexGain(Gain):
         gain = self.best(model, data)
         penalty = (jnp.real(gain) ** 2 + jnp.imag(gain) ** 2) / self.scale**2
         return -_square(gain[..., None, None] * model - data) - penalty - jnp.log1p(self.scale**2 * _square(model))
+
+    def log_power_mean(self, model: jax.Array, data: jax.Array, rest: jax.Array, power: jax.Array) -> jax.Array:
+        square = _square(model)
+        dark = square == 0
+        size = jnp.where(dark, jnp.ones_like(square), square)
+        gain = _product(model, data) / size
+        signal = size * (jnp.real(gain) ** 2 + jnp.imag(gain) ** 2)
+        least = _square(gain[..., None, None] * model - data)
+        return log_gain_mean(power, rest + least, jnp.where(dark, 0 * signal, signal), self.scale**2 * square)
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         pair: Any = rng.normal(scale=self.scale / np.sqrt(2), size=(2, *shape))

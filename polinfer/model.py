@@ -17,13 +17,16 @@ from .checks import one_of_types, real_number
 from .circular import wrap
 from .elements import multiply
 from .gain import Gain, UnitGain
-from .noise import KnownNoise
+from .neighbours import Pooled, Window, Windowed, pool
+from .noise import KnownNoise, Noise
 from .orderings import Ordering, RetarderFirst
 from .priors import Prior, default_priors
 from .records import PERIODS, RANGES, Measurement, Parameters
-from .statistics import Statistics, summarise
+from .statistics import Statistics, Summary, summarise
 
 __all__ = ["Model"]
+
+BLOCK = 4096  # pixels whose windows are in memory at once
 
 
 class _Frozen(dict):
@@ -70,8 +73,9 @@ class Model:
     ----------
     ordering: the order in which light meets the elements, :class:`RetarderFirst` or :class:`PolariserFirst`.
     priors: dict of priors by parameter name, over the defaults of :func:`polinfer.priors.default_priors`.
-    noise: :class:`KnownNoise`.
+    noise: :class:`KnownNoise` or :class:`InferredNoise`.
     gain: :class:`PhaseGain`, :class:`ComplexGain`, or None: g = 1.
+    neighbours: :class:`Window` whose pixels share the parameters (a gain remains one for each pixel), or None.
     fixed: dict of known values by parameter name. A parameter that then drops out of J is integrated out: with
         ``diattenuation`` 0 its angle; with ``retardance`` 0 its angle and the circularity; with ``retardance_angle``
         0 or pi/2 the circularity.
@@ -92,15 +96,18 @@ class Model:
 
     ordering: Ordering = RetarderFirst()
     priors: Any = None
-    noise: KnownNoise = KnownNoise()
+    noise: Noise = KnownNoise()
     gain: Gain | None = None
+    neighbours: Window | None = None
     fixed: Any = None
 
     def __post_init__(self) -> None:
         one_of_types("ordering", self.ordering, (Ordering,), "pass an instance such as RetarderFirst().")
-        one_of_types("noise", self.noise, (KnownNoise,), "pass KnownNoise().")
+        one_of_types("noise", self.noise, (Noise,), "pass KnownNoise() or InferredNoise(shape, scale, scope).")
         if self.gain is not None:
             one_of_types("gain", self.gain, (Gain,), "pass PhaseGain(), ComplexGain(scale) or None.")
+        if self.neighbours is not None:
+            one_of_types("neighbours", self.neighbours, (Window,), "pass Window(rows, columns) or None.")
         fixed = _known_names("fixed", self.fixed)
         for name, value in fixed.items():
             low, high = getattr(RANGES, name)
@@ -194,14 +201,14 @@ class Model:
         return jnp.asarray(total)
 
     def log_likelihood(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
-        """Log density of the data, the gain integrated out (nats); shape P broadcast with that of the parameters.
+        """Log density of the data, gain and noise integrated out (nats); shape P broadcast with that of the parameters.
 
-        ``-|g J U - V|^2 / sigma^2 - 2 n log(pi sigma^2)`` for a known g. NaN in masked pixels and where the response
-        is not finite.
+        ``-|g J U - V|^2 / sigma^2 - 2 n log(pi sigma^2)`` for known g and sigma. With neighbours it is that of all data
+        of the window around each pixel. NaN in masked pixels and where the response is not finite.
 
         Raises
         ------
-        ValueError: the measurement has no sigma.
+        ValueError: the measurement has no sigma, or has one that is to be inferred (see :class:`InferredNoise`).
 
         >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
         >>> round(float(Model().log_likelihood(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
@@ -221,41 +228,63 @@ class Model:
     def _evaluate(self, function: Any, parameters: Parameters, measurement: Measurement) -> jax.Array:
         one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
         one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
-        summary = summarise(measurement, self.noise.sigma(measurement))
-        statistics = as_device(summary.statistics, measurement.response.dtype)
-        values = function(self, Parameters(*(jnp.asarray(value) for value in parameters)), statistics)
+        given = Parameters(*(jnp.asarray(value) for value in parameters))
+        summary, dtype = summarise(measurement, self.noise.sigma(measurement)), measurement.response.dtype
+        if self.neighbours is None:
+            values = function(self, given, as_device(summary.statistics, dtype))
+        else:
+            values = self._evaluate_windows(function, given, summary, dtype)
         return jnp.where(summary.masked | summary.non_finite, jnp.nan, values)
 
-    def log_density(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
+    def _evaluate_windows(self, function: Any, given: Parameters, summary: Summary, dtype: np.dtype) -> jax.Array:
+        pooled = self.pool(summary)
+        shape = np.broadcast_shapes(*(value.shape for value in given), summary.masked.shape)
+        pixels = np.broadcast_to(np.arange(summary.masked.size).reshape(summary.masked.shape), shape).reshape(-1)
+        spread = [jnp.broadcast_to(value, shape).reshape(-1) for value in given]
+        parts = [jnp.zeros(0, spread[0].dtype)]
+        for begin in range(0, len(pixels), BLOCK):
+            part = slice(begin, begin + BLOCK)
+            statistics = as_device(pooled.take(pixels[part]), dtype)
+            parts.append(function(self, Parameters(*(value[part] for value in spread)), statistics))
+        return jnp.concatenate(parts[1:] or parts).reshape(shape)
+
+    def pool(self, summary: Summary) -> Pooled:
+        """Sufficient statistics of the window around every pixel, or of the pixels themselves without neighbours."""
+        return pool(summary, self.neighbours, self.known_gain, self.noise)
+
+    def log_density(self, parameters: Parameters, statistics: Statistics | Windowed) -> jax.Array:
         """Log posterior density from sufficient statistics: element-wise, for JAX transformations."""
         prior = self.log_prior(parameters)
         # outside the support there may be no matrix, and the density is 0 all the same
         return jnp.where(prior == -jnp.inf, -jnp.inf, self.log_data(parameters, statistics) + prior)
 
-    def log_data(self, parameters: Parameters, statistics: Statistics) -> jax.Array:
+    def log_data(self, parameters: Parameters, statistics: Statistics | Windowed) -> jax.Array:
         """Log likelihood from sufficient statistics: element-wise, for JAX transformations."""
-        seen = multiply(self.jones(parameters), statistics.illumination)
-        return self.known_gain.log_marginal(seen, statistics.response) + statistics.constant
+        if isinstance(statistics, Statistics):
+            seen = multiply(self.jones(parameters), statistics.illumination)
+            return self.noise.log_marginal(self.known_gain, seen, statistics)
+        members = statistics.statistics
+        shared = Parameters(*(jnp.asarray(value)[..., None] for value in parameters))
+        seen = multiply(self.jones(shared), members.illumination)
+        first = seen[..., 0, :, :]
+        total = jnp.sum(self.noise.log_marginal(self.known_gain, seen, members), axis=-1)
+        return total + statistics.dark * self.known_gain.log_marginal(first, jnp.zeros_like(first))
 
 
 @partial(jax.jit, static_argnums=0)
-def _log_data(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+def _log_data(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> jax.Array:
     return model.log_data(parameters, statistics)
 
 
 @partial(jax.jit, static_argnums=0)
-def _log_density(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+def _log_density(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> jax.Array:
     return model.log_density(parameters, statistics)
 
 
-def as_device(statistics: Statistics, dtype: Any) -> Statistics:
+def as_device(statistics: Any, dtype: Any) -> Any:
     """Statistics as JAX arrays in the precision of complex ``dtype`` (single where JAX has no double enabled)."""
     complex_type = jax.dtypes.canonicalize_dtype(dtype)
     real_type = np.zeros((), complex_type).real.dtype
-    return Statistics(
-        jnp.asarray(statistics.illumination.astype(complex_type)),
-        jnp.asarray(statistics.response.astype(complex_type)),
-        jnp.asarray(statistics.residual.astype(real_type)),
-        jnp.asarray(statistics.constant.astype(real_type)),
-        jnp.asarray(statistics.count.astype(real_type)),
+    return jax.tree.map(
+        lambda x: jnp.asarray(np.asarray(x).astype(complex_type if np.iscomplexobj(x) else real_type)), statistics
     )

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..model import Model
+from ..neighbours import Windowed
 from ..records import Parameters
 from ..statistics import Statistics
 from .local_gaussian import RANGE_CURVATURE, derivatives, invert, log_density, log_prior_ratio, uniform_std
@@ -35,7 +36,9 @@ def _distances(dtype: np.dtype, span: float) -> tuple[np.ndarray, float]:
     return span * np.exp(grid), grid[1] - grid[0]
 
 
-def integrate(model: Model, name: str, high: np.ndarray, parameters: Parameters, statistics: Statistics) -> Edge:
+def integrate(
+    model: Model, name: str, high: np.ndarray, parameters: Parameters, statistics: Statistics | Windowed
+) -> Edge:
     """Integrate over ``name`` from its upper (``high``) or lower bound in every pixel."""
     free, k = model.free, model.free.index(name)
     bounds = model.bounds[name]

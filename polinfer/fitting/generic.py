@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import gammaincc
 
 from ..checks import one_of_types
 from ..degeneracy import REFERENCE, nearest, reduce_ranges
-from ..elements import multiply
 from ..model import Model, as_device
+from ..neighbours import Pooled, Windowed
+from ..noise import InferredNoise, KnownNoise
 from ..records import Fit, Measurement, Parameters, Status
-from ..statistics import TRAILING, Statistics, Summary, summarise
+from ..statistics import Statistics, Summary, least_squares_jones, summarise
 from .charts import from_parameters, to_parameters
 from .edges import integrate
+from .frame_noise import Search, effective_parameters, first_guess, misfit
 from .local_gaussian import Local, describe, equivalent, log_density, uniform_std
 from .newton import maximise
+from .residuals import judge, tail_probability
 from .start import starts
 
 __all__ = ["fit"]
 
 CHUNK = 2048  # pixels whose starting points are in memory at once
 ITERATIONS = 60
+DESIGN, DESIGN_WARM = 6, 2  # starts from the design, without and with an earlier fit
+FRAME_ROUNDS = 30
 BAD_FIT_PROBABILITY = 1e-3
 
 
@@ -35,7 +40,14 @@ class _Best(NamedTuple):
     converged: np.ndarray
 
 
-def _canonical(model: Model, parameters: Parameters, statistics: Statistics) -> Parameters:
+def _strength(statistics: Statistics | Windowed) -> np.ndarray:
+    """Signal-to-noise ratio of a pixel or of a window."""
+    plain = statistics if isinstance(statistics, Statistics) else statistics.statistics
+    power = np.sum(np.abs(np.asarray(plain.illumination)) ** 2, axis=(-1, -2))
+    return np.sqrt(power if isinstance(statistics, Statistics) else np.sum(power, axis=-1))
+
+
+def _canonical(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> Parameters:
     """Of the equivalent copies with the highest density, the one nearest to the reference."""
     copies = equivalent(model, parameters)
     prior = np.asarray(model.log_prior(copies))
@@ -43,8 +55,7 @@ def _canonical(model: Model, parameters: Parameters, statistics: Statistics) -> 
     likelihood = np.where(np.isnan(likelihood), -np.inf, likelihood)
     # Likelihoods of copies differ by rounding only, eps times the signal-to-noise ratio, unless an ordering of the
     # user's own breaks the symmetry.
-    strength = np.sqrt(np.sum(np.abs(np.asarray(statistics.illumination)) ** 2, axis=(-1, -2)))
-    rounding = 30 * np.finfo(prior.dtype).eps * (1 + strength)
+    rounding = 30 * np.finfo(prior.dtype).eps * (1 + _strength(statistics))
     highest = likelihood.max(axis=0)
     density = prior + np.where(likelihood >= highest - rounding, highest, likelihood)
     slack = 1e-6 if density.dtype == np.float64 else 1e-3
@@ -52,10 +63,19 @@ def _canonical(model: Model, parameters: Parameters, statistics: Statistics) -> 
     return nearest(copies, Parameters(*(np.asarray(x, density.dtype) for x in REFERENCE)), allowed)
 
 
-def _search(model: Model, host: Statistics, statistics: Statistics, earlier: Parameters | None, count: int) -> _Best:
-    """Most probable parameters of every pixel of a chunk."""
+def _search(
+    model: Model,
+    host: Statistics | Windowed,
+    statistics: Statistics | Windowed,
+    earlier: Parameters | None,
+    design: int | None,
+) -> _Best:
+    """Most probable parameters of every pixel of a chunk; ``design`` None: from the earlier ones alone."""
     dtype = np.asarray(statistics.residual).dtype
-    points = starts(model, host, statistics, earlier, count).astype(dtype)
+    if design is None and earlier is not None:
+        points = (from_parameters(model, earlier) * (1 - 1e-4) + 1e-4)[:, None].astype(dtype)
+    else:
+        points = starts(model, host, statistics, earlier, design or 0).astype(dtype)
     pixels, number, free = points.shape
     index = np.repeat(np.arange(pixels), number)
     found, value, _ = maximise(model, statistics, index, points.reshape(-1, free), ITERATIONS)
@@ -73,15 +93,6 @@ def _arrays(model: Model, coordinates: np.ndarray) -> Parameters:
     return reduce_ranges(model.complete(to_parameters(model, jnp.asarray(coordinates))))
 
 
-@partial(jax.jit, static_argnums=0)
-def _residual(model: Model, parameters: Parameters, statistics: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Log posterior, chi-square at the most probable gain, and the mean gain."""
-    seen, gain = multiply(model.jones(parameters), statistics.illumination), model.known_gain
-    rest = gain.best(seen, statistics.response)[..., None, None] * seen - statistics.response
-    chi_square = 2 * (jnp.sum(jnp.abs(rest) ** 2, axis=(-1, -2)) + statistics.residual)
-    return model.log_density(parameters, statistics), chi_square, gain.mean(seen, statistics.response)
-
-
 def _on_bounds(model: Model, parameters: Parameters, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels lie on the lower and on the upper bound of a parameter."""
     value, (low, high) = np.asarray(getattr(parameters, name)), model.bounds[name]
@@ -89,7 +100,7 @@ def _on_bounds(model: Model, parameters: Parameters, name: str) -> tuple[np.ndar
     return value <= low + near, value >= high - near
 
 
-def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics, local: Local) -> Local:
+def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics | Windowed, local: Local) -> Local:
     """Replace the Gaussian where the maximum is on a bound, and its evidence also where a bound is near."""
     for name, (low, high) in model.bounds.items():
         k, value = model.free.index(name), np.asarray(getattr(parameters, name))
@@ -108,7 +119,7 @@ def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics,
             name,
             (value > 0.5 * (low + high))[padded],
             Parameters(*(np.asarray(x)[padded] for x in parameters)),
-            Statistics(*(np.asarray(x)[padded] for x in statistics)),
+            jax.tree.map(lambda x, rows=padded: np.asarray(x)[rows], statistics),
         )
         better = edge.log_evidence[: len(chosen)]
         local.log_evidence[chosen] = np.where(np.isfinite(better), better, local.log_evidence[chosen])
@@ -119,23 +130,19 @@ def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics,
     return local
 
 
-def _flat(values: np.ndarray, shape: tuple[int, ...], trailing: int, chosen: np.ndarray) -> np.ndarray:
-    tail = values.shape[values.ndim - trailing :] if trailing else ()
-    return np.broadcast_to(values, shape + tail).reshape(-1, *tail)[chosen]
-
-
 def fit(model: Model, measurement: Measurement, start: Fit | None = None, progress: bool = False) -> Fit:
     """The most probable parameters of every pixel, with a local Gaussian around them.
 
     Maximises ``log p(data | parameters) + log p(parameters)``, the density in D, theta_D, eta, theta_eta, xi (radians),
-    with the gain integrated out; every pixel on its own, by Newton steps from several starts. Of the equivalent
-    parameter sets with the highest density the canonical one is reported (:func:`polinfer.canonicalise`). Nothing is
-    random. The precision is that of the measurement: complex64 data give float32 results; complex128 data give float64
-    results where JAX has double precision enabled (``jax.config.update("jax_enable_x64", True)``), else float32.
+    with the gain integrated out; every pixel (or the window around it) on its own, by Newton steps from several starts.
+    Of the equivalent parameter sets with the highest density the canonical one is reported
+    (:func:`polinfer.canonicalise`). Nothing is random. The precision is that of the measurement: complex64 data give
+    float32 results; complex128 data give float64 results where JAX has double precision enabled
+    (``jax.config.update("jax_enable_x64", True)``), else float32.
 
     Parameters
     ----------
-    model: the scene. measurement: the data, pixel shape P; it must know sigma.
+    model: the scene. measurement: the data, pixel shape P; it must know sigma unless the model infers it.
     start: an earlier fit of the same pixel shape and similar data (a video): its parameters are tried first and fewer
         other starts are needed.
     progress: show a progress bar.
@@ -146,12 +153,16 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
 
     Raises
     ------
-    ValueError: no sigma, a start of another shape, nothing free to fit. TypeError: arguments of a wrong kind.
+    ValueError: no sigma, or one that is to be inferred, a start of another shape, nothing free to fit. TypeError:
+    arguments of a wrong kind.
 
     Notes
     -----
     Standard deviations come from the curvature at the maximum. On a bound (``Status.AT_EDGE``) the density is not a
     Gaussian there.
+
+    With ``InferredNoise`` of scope "frame" the most probable sigma of the frame is found first by repeated fits, as the
+    maximum of the density of log sigma^2 with the parameters integrated out (Laplace); all else is given this sigma.
 
     Source: Gordon et al., supplementary information, inference of polarimetric parameters; Laplace approximation.
 
@@ -172,24 +183,23 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
             raise ValueError(f"start has pixel shape {start.status.shape} and measurement {shape}; they must agree.")
     if not model.free:
         raise ValueError("model has no free parameter to fit; fix fewer of them.")
-    sigma = model.noise.sigma(measurement)
-    summary = summarise(measurement, sigma)
-    good = np.flatnonzero(~(summary.masked | summary.non_finite).reshape(-1))
-    host = Statistics(*(_flat(x, shape, t, good) for x, t in zip(summary.statistics, TRAILING, strict=True)))
     earlier = None
     if start is not None:
-        earlier = Parameters(*(_flat(np.asarray(x), shape, 0, good) for x in start.parameters))
-    chunks = range(0, len(good), CHUNK)
-    if progress:
-        from tqdm import tqdm
+        earlier = Parameters(*(np.asarray(x).reshape(-1) for x in start.parameters))
+    if isinstance(model.noise, InferredNoise) and not model.noise.integrated:
+        return _fit_frame(model, model.noise, measurement, earlier, progress)
+    prepared = _prepare(model, measurement, model.noise.integrated)
+    parts = list(_parts(prepared, earlier, DESIGN if earlier is None else DESIGN_WARM, progress))
+    return _assemble(model, prepared, model.noise.sigma(measurement), parts, start is not None)
 
-        chunks = tqdm(chunks, desc="fit", unit="chunk")
-    parts = []
-    for begin in chunks:
-        part = slice(begin, begin + CHUNK)
-        known = None if earlier is None else Parameters(*(x[part] for x in earlier))
-        parts.append(_fit_chunk(model, Statistics(*(x[part] for x in host)), measurement.response.dtype, known))
-    return _assemble(model, measurement, summary, sigma, good, parts, start is not None)
+
+class _Prepared(NamedTuple):
+    model: Model
+    measurement: Measurement
+    summary: Summary
+    pooled: Pooled
+    good: np.ndarray
+    sigma_unknown: bool
 
 
 class _Part(NamedTuple):
@@ -198,24 +208,99 @@ class _Part(NamedTuple):
     status: np.ndarray
 
 
-def _fit_chunk(model: Model, host: Statistics, dtype: np.dtype, earlier: Parameters | None) -> _Part:
-    count = len(host.residual)
+def _prepare(model: Model, measurement: Measurement, sigma_unknown: bool) -> _Prepared:
+    summary = summarise(measurement, model.noise.sigma(measurement))
+    good = np.flatnonzero(~(summary.masked | summary.non_finite).reshape(-1))
+    return _Prepared(model, measurement, summary, model.pool(summary), good, sigma_unknown)
+
+
+def _parts(prepared: _Prepared, earlier: Parameters | None, design: int | None, progress: bool) -> Iterable[_Part]:
+    """Fits of all good pixels, chunk by chunk; ``earlier`` are parameters of all pixels."""
+    model, pooled, good = prepared.model, prepared.pooled, prepared.good
+    # the starting points of a window take its size in memory, those of an integral over sigma the number of its nodes
+    cost = 1 if model.neighbours is None else model.neighbours.rows * model.neighbours.columns
+    cost *= 8 if model.noise.integrated else 1
+    size = max(CHUNK // cost, 64)
+    chunks: Any = range(0, len(good), size)
+    if progress:
+        from tqdm import tqdm
+
+        chunks = tqdm(chunks, desc="fit", unit="chunk")
+    for begin in chunks:
+        chosen = good[begin : begin + size]
+        known = None if earlier is None else Parameters(*(x[chosen] for x in earlier))
+        own = Statistics(*(x[chosen] for x in pooled.own))
+        yield _fit_chunk(prepared, pooled.take(chosen), own, known, design)
+
+
+def _fit_frame(
+    model: Model, noise: InferredNoise, measurement: Measurement, earlier: Parameters | None, progress: bool
+) -> Fit:
+    """Fit with one unknown sigma for all pixels."""
+    noise.refuse(measurement)
+    given = replace(model, noise=KnownNoise())
+
+    def at(variance: float) -> _Prepared:
+        return _prepare(given, replace(measurement, sigma=np.sqrt(variance)), True)
+
+    unit = at(1.0)
+    own = Statistics(*(x[unit.good] for x in unit.pooled.own))
+    closed = model.ordering.decompose(least_squares_jones(own))
+    search = Search(noise, first_guess(noise, own, None if closed is None else np.asarray(given.jones(closed))))
+    warm = earlier
+    design: int | None = DESIGN if earlier is None else DESIGN_WARM
+    for _ in range(FRAME_ROUNDS if len(unit.good) else 0):
+        prepared = at(search.variance)
+        parts = list(_parts(prepared, warm, design, progress))
+        misfits, fitted = (np.concatenate([part.values[name] for part in parts]) for name in ("misfit", "effective"))
+        data = prepared.pooled.data.reshape(-1)[prepared.good]
+        copies = float(np.sum(data)) / max(float(np.sum(own.count)), 1.0)
+        search.update(misfits, data, fitted, copies)
+        warm, design = _spread_parameters(prepared, parts), None
+        if search.converged:
+            break
+    final = at(search.variance)
+    parts = list(_parts(final, warm, DESIGN_WARM, progress))
+    return _assemble(model, final, np.full(measurement.shape, np.sqrt(search.variance)), parts, earlier is not None)
+
+
+def _spread_parameters(prepared: _Prepared, parts: list[_Part]) -> Parameters:
+    """Parameters of all pixels, NaN where there is no fit."""
+    found = {}
+    for name in Parameters._fields:
+        values = [part.values[name] for part in parts]
+        found[name] = np.full(prepared.summary.masked.size, np.nan, values[0].dtype)
+        found[name][prepared.good] = np.concatenate(values)
+    return Parameters(**found)
+
+
+def _fit_chunk(
+    prepared: _Prepared,
+    host: Statistics | Windowed,
+    own: Statistics,
+    earlier: Parameters | None,
+    design: int | None,
+) -> _Part:
+    model, dtype, count = prepared.model, prepared.measurement.response.dtype, len(own.count)
     # code is compiled for a shape: pad to a power of two, so that few shapes occur
     size = 1 << (count - 1).bit_length()
     fill = np.concatenate([np.arange(count), np.zeros(size - count, int)])
-    host = Statistics(*(x[fill] for x in host))
+    host, own = (jax.tree.map(lambda x: x[fill], values) for values in (host, own))
     earlier = None if earlier is None else Parameters(*(x[fill] for x in earlier))
-    statistics = as_device(host, dtype)
-    best = _search(model, host, statistics, earlier, 2 if earlier is not None else 6)
+    statistics, own = as_device(host, dtype), as_device(own, dtype)
+    best = _search(model, host, statistics, earlier, design)
     local = _correct_edges(model, best.parameters, statistics, describe(model, best.parameters, statistics))
-    log_posterior, chi_square, gain = (np.asarray(x) for x in _residual(model, best.parameters, statistics))
+    effective = np.zeros(size)
+    if prepared.sigma_unknown:
+        effective = effective_parameters(model, best.parameters, local.covariance)
+    real_type = statistics.residual.dtype
+    judged = judge(model, best.parameters, statistics, own, jnp.asarray(effective, real_type))
     status = np.where(best.converged, 0, int(Status.NOT_CONVERGED))
     for name in model.bounds:
         low, high = _on_bounds(model, best.parameters, name)
         status = status | np.where(low | high, int(Status.AT_EDGE), 0)
     for i, name in enumerate(model.free):
         status = status | np.where(local.unidentified[:, i], int(Status.unidentified(name)), 0)
-    real_type = chi_square.dtype
     covariance = np.zeros((size, 5, 5), real_type)
     places = np.array([Parameters._fields.index(name) for name in model.free])
     covariance[:, places[:, None], places] = local.covariance
@@ -223,22 +308,18 @@ def _fit_chunk(model: Model, host: Statistics, dtype: np.dtype, earlier: Paramet
     for name in model.dropped:
         values[name] = np.full(size, np.nan, real_type)
         status = status | int(Status.unidentified(name))
-    values |= {"log_posterior": log_posterior, "chi_square": chi_square, "gain": gain}
+    values |= {name: np.asarray(value) for name, value in judged._asdict().items()}
+    values["effective"] = effective
+    if prepared.sigma_unknown and not model.noise.integrated:
+        values["misfit"] = np.asarray(misfit(model, best.parameters, statistics), float)
     values["log_evidence"] = local.log_evidence.astype(real_type)
     return _Part({name: x[:count] for name, x in values.items()}, covariance[:count], status[:count])
 
 
-def _assemble(
-    model: Model,
-    measurement: Measurement,
-    summary: Summary,
-    sigma: np.ndarray,
-    good: np.ndarray,
-    parts: list[_Part],
-    started: bool,
-) -> Fit:
-    """Put the chunks back into the frame, and judge the residuals."""
-    shape = measurement.shape
+def _assemble(model: Model, prepared: _Prepared, sigma: np.ndarray | None, parts: list[_Part], started: bool) -> Fit:
+    """Put the chunks back into the frame, and judge the residuals; ``sigma`` None: that of the parts."""
+    summary, pooled, good = prepared.summary, prepared.pooled, prepared.good
+    shape = prepared.measurement.shape
     real_type = parts[0].covariance.dtype if parts else np.dtype(float)
 
     def spread(values: list[np.ndarray], dtype: np.dtype | type, tail: tuple[int, ...] = ()) -> np.ndarray:
@@ -261,12 +342,17 @@ def _assemble(
     status = status.reshape(shape)
     status = np.where(summary.non_finite, int(Status.NON_FINITE), status)
     status = np.where(summary.masked, int(Status.MASKED), status).astype(np.int32)
-    fitted = np.minimum(len(model.free) + model.known_gain.real_parameters, 4 * summary.rank)
-    degrees = np.maximum(4 * summary.states - fitted, 0).astype(np.int32)
+    gains = model.known_gain.real_parameters
+    fitted = np.minimum(len(model.free) + gains * pooled.pixels, 4 * pooled.rank)
+    degrees = np.maximum(2 * pooled.data - fitted, 0).astype(np.int32)
+    own = np.broadcast_to(pooled.own.count, (status.size,)).reshape(shape)
+    share = np.minimum(len(model.free) * own / np.maximum(pooled.data, 1) + gains, 4 * summary.rank)
     chi_square = value("chi_square")
-    with np.errstate(invalid="ignore"):
-        bad = (degrees > 0) & (gammaincc(0.5 * np.maximum(degrees, 1), 0.5 * chi_square) < BAD_FIT_PROBABILITY)
-    status = np.where(bad, status | int(Status.BAD_FIT), status).astype(np.int32)
+    likely = tail_probability(model, chi_square, degrees, value("residual"), 2 * own - share)
+    status = np.where(likely < BAD_FIT_PROBABILITY, status | int(Status.BAD_FIT), status).astype(np.int32)
+    if sigma is None:
+        with np.errstate(divide="ignore"):
+            sigma = value("precision") ** -0.5
     complex_type = np.result_type(real_type, np.complex64)
     return Fit(
         model=model,

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..degeneracy import orbit
 from ..model import Model
+from ..neighbours import Windowed
 from ..records import PERIODS, RANGES, Parameters
 from ..statistics import Statistics
 from .newton import value_gradient_hessian
@@ -59,9 +60,9 @@ def equivalent(model: Model, parameters: Parameters) -> Parameters:
 
 
 @partial(jax.jit, static_argnums=0)
-def log_density(model: Model, parameters: Parameters, statistics: Statistics) -> jax.Array:
+def log_density(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> jax.Array:
     """Log posterior of parameters ``(copies, pixels)``."""
-    return model.log_density(parameters, Statistics(*(x[None] for x in statistics)))
+    return model.log_density(parameters, jax.tree.map(lambda x: x[None], statistics))
 
 
 # A direction cannot hold more volume than its range: sqrt(2 pi / curvature) <= sqrt(12) uniform standard deviations.
@@ -98,10 +99,12 @@ def log_prior_ratio(model: Model, parameters: Parameters) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def derivatives(model: Model, points: jax.Array, statistics: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
+def derivatives(
+    model: Model, points: jax.Array, statistics: Statistics | Windowed
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Log posterior, gradient and Hessian in the free parameters at ``points`` (copies, pixels, free)."""
 
-    def one(point: jax.Array, data: Statistics) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def one(point: jax.Array, data: Statistics | Windowed) -> tuple[jax.Array, jax.Array, jax.Array]:
         def function(x: jax.Array) -> jax.Array:
             values = dict.fromkeys(Parameters._fields, jnp.zeros((), x.dtype))
             values |= {name: x[i] for i, name in enumerate(model.free)}
@@ -112,7 +115,7 @@ def derivatives(model: Model, points: jax.Array, statistics: Statistics) -> tupl
     return jax.vmap(jax.vmap(one), in_axes=(0, None))(points, statistics)
 
 
-def describe(model: Model, parameters: Parameters, statistics: Statistics) -> Local:
+def describe(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> Local:
     """Covariance at ``parameters`` (pixels,) and the evidence summed over the equivalent copies.
 
     Every copy is a maximum of the likelihood but not of the prior, so its Gaussian integral is that of a parabola with

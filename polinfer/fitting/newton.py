@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..model import Model
+from ..neighbours import Windowed
 from ..statistics import Statistics
 from .charts import to_parameters
 
@@ -57,7 +58,7 @@ def value_gradient_hessian(
     return value, slope, hessian
 
 
-def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
+def _advance(model: Model, statistics: Statistics | Windowed, state: _State) -> _State:
     """One iteration of one problem."""
     dtype = state.point.dtype
     eps = jnp.finfo(dtype).eps
@@ -106,7 +107,7 @@ def _advance(model: Model, statistics: Statistics, state: _State) -> _State:
 
 
 @partial(jax.jit, static_argnums=0)
-def _advance_round(model: Model, statistics: Statistics, state: _State) -> _State:
+def _advance_round(model: Model, statistics: Statistics | Windowed, state: _State) -> _State:
     step = jax.vmap(partial(_advance, model))
 
     def body(carry: tuple[jax.Array, _State]) -> tuple[jax.Array, _State]:
@@ -136,7 +137,7 @@ def _fresh(points: np.ndarray) -> _State:
 
 
 def maximise(
-    model: Model, statistics: Statistics, pixels: np.ndarray, points: np.ndarray, iterations: int
+    model: Model, statistics: Statistics | Windowed, pixels: np.ndarray, points: np.ndarray, iterations: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Maximise the log posterior of ``pixels[i]`` (an index into the statistics) from ``points[i]``, for every i.
 
@@ -147,13 +148,13 @@ def maximise(
     state = _fresh(points)
     spent = np.zeros(problems, int)
     waiting = np.arange(problems)
-    host = Statistics(*(np.asarray(x) for x in statistics))
+    host = jax.tree.map(np.asarray, statistics)
     while len(waiting):
         active, waiting = waiting[:lanes], waiting[lanes:]
         index = np.concatenate([active, np.full(lanes - len(active), active[0])])
         lane = _State(*(x[index] for x in state))
         lane.finished[len(active) :] = True
-        data = Statistics(*(x[pixels[index]] for x in host))
+        data = jax.tree.map(lambda x, chosen=pixels[index]: x[chosen], host)
         done = _advance_round(model, data, lane)
         for old, new in zip(state, done, strict=True):
             old[active] = np.asarray(new)[: len(active)]

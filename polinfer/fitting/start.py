@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..model import Model
+from ..neighbours import Windowed, mean_jones
 from ..records import Parameters
-from ..statistics import Statistics, least_squares_jones
+from ..statistics import Statistics
 from .charts import from_parameters, to_parameters
 
 __all__ = ["starts"]
@@ -36,16 +37,20 @@ def _design(model: Model) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _best_of_design(model: Model, count: int, statistics: Statistics) -> jax.Array:
+def _best_of_design(model: Model, count: int, statistics: Statistics | Windowed) -> jax.Array:
     points = jnp.asarray(_design(model), statistics.residual.dtype)
-    one_more = Statistics(*(values[None] for values in statistics))
+    one_more = jax.tree.map(lambda x: x[None], statistics)
     spread = jax.tree.map(lambda x: x[:, None], to_parameters(model, points))
     _, best = jax.lax.top_k(model.log_density(spread, one_more).T, count)
     return points[best]
 
 
 def starts(
-    model: Model, summary_statistics: Statistics, statistics: Statistics, earlier: Parameters | None, count: int
+    model: Model,
+    summary_statistics: Statistics | Windowed,
+    statistics: Statistics | Windowed,
+    earlier: Parameters | None,
+    count: int,
 ) -> np.ndarray:
     """Starting coordinates ``(pixels, starts, free)`` of a chunk of pixels.
 
@@ -53,7 +58,7 @@ def starts(
     from a fit of similar data, which then lead; ``count`` points are taken from the design.
     """
     chosen = []
-    closed = model.ordering.decompose(least_squares_jones(summary_statistics))
+    closed = model.ordering.decompose(mean_jones(summary_statistics, aligned=not model.known_gain.free_phase))
     if earlier is not None:
         known = [np.asarray(x, float) for x in earlier]
         if closed is not None:

@@ -188,7 +188,7 @@ def test_parameters_that_drop_out_are_ignored():
         (lambda: Model(fixed={"circularity": np.nan}), ValueError, "finite"),
         (lambda: Model(gain=1.0), TypeError, "gain must be Gain"),
         (lambda: Model(ordering=RetarderFirst), TypeError, "ordering must be Ordering"),
-        (lambda: Model(noise=0.1), TypeError, "noise must be KnownNoise"),
+        (lambda: Model(noise=0.1), TypeError, "noise must be Noise, got float 0.1; pass KnownNoise"),
         (lambda: ComplexGain(0.0), ValueError, "scale must be > 0"),
         (
             lambda: KnownNoise().sigma(Measurement(np.eye(2), np.eye(2))),
