@@ -8,13 +8,14 @@ import numpy as np
 
 from .checks import complex_array, one_of_types, real_array
 from .degeneracy import canonicalise
+from .neighbours import Window, box_mean
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .records import Parameters
 
 __all__ = ["decompose", "ordering_error"]
 
 
-def decompose(jones: Any, ordering: Ordering) -> Parameters:
+def decompose(jones: Any, ordering: Ordering, neighbours: Window | None = None) -> Parameters:
     """Parameters of measured Jones matrices in closed form: no iteration, no prior.
 
     The diattenuator follows from ``J J^H`` (or ``J^H J``), the retarder is the one nearest to what is left. Exact for
@@ -25,14 +26,16 @@ def decompose(jones: Any, ordering: Ordering) -> Parameters:
     ----------
     jones: complex ``(*P, 2, 2)``. ordering: one that has a closed form, :class:`RetarderFirst` or
         :class:`PolariserFirst`.
+    neighbours: a window over whose finite matrices the mean is taken first, or None. Matrices are added as they are:
+        phases of their own in every pixel cancel, for these use :func:`polinfer.fit`.
 
     Returns
     -------
-    Parameters of shape P, the canonical ones, radians; NaN where a matrix is not finite or zero.
+    Parameters of shape P, the canonical ones, radians; NaN where a matrix is not finite, or the one decomposed is zero.
 
     Raises
     ------
-    ValueError: a wrong shape, or an ordering without a closed form.
+    ValueError: a wrong shape, or an ordering without a closed form. TypeError: arguments of a wrong kind.
 
     >>> truth = Parameters(0.3, 0.4, 1.0, 0.6, 0.2)
     >>> found = decompose(2j * RetarderFirst().jones(truth), RetarderFirst())
@@ -41,11 +44,14 @@ def decompose(jones: Any, ordering: Ordering) -> Parameters:
     """
     one_of_types("ordering", ordering, (Ordering,), "pass an instance such as RetarderFirst().")
     matrices = complex_array("jones", jones, trailing=(2, 2))
+    real_type = np.zeros((), matrices.dtype).real.dtype
+    if neighbours is not None:
+        one_of_types("neighbours", neighbours, (Window,), "pass Window(rows, columns) or None.")
+        matrices = box_mean(matrices, neighbours, trailing=2)
     useful = np.isfinite(matrices).all(axis=(-1, -2)) & (np.abs(matrices) > 0).any(axis=(-1, -2))
     found = ordering.decompose(np.where(useful[..., None, None], matrices.astype(np.complex128), np.eye(2)))
     if found is None:
         raise ValueError(f"ordering {type(ordering).__name__} has no closed form; use fit.")
-    real_type = np.zeros((), matrices.dtype).real.dtype
     return Parameters(*(np.where(useful, x, np.nan).astype(real_type) for x in canonicalise(found)))
 
 

@@ -21,7 +21,7 @@ from ..records import PERIODS, Parameters
 from ..statistics import Statistics
 from .local_gaussian import RANGE_CURVATURE, uniform_std
 
-__all__ = ["Search", "effective_parameters", "misfit"]
+__all__ = ["Search", "effective_parameters", "misfit", "prior_curvature"]
 
 TOLERANCE = 1e-4  # of sigma^2, relative
 
@@ -62,14 +62,19 @@ def _prior_curvature(model: Model, points: jax.Array) -> jax.Array:
     return jnp.stack(columns, axis=-1)
 
 
+def prior_curvature(model: Model, parameters: Parameters) -> np.ndarray:
+    """Negative second derivatives of the log prior in the free parameters, ``(pixels, free)``; 0 on a bound."""
+    points = np.stack([np.asarray(getattr(parameters, name)) for name in model.free], axis=-1)
+    return np.nan_to_num(np.asarray(_prior_curvature(model, points), float), posinf=0.0, neginf=0.0)
+
+
 def effective_parameters(model: Model, parameters: Parameters, covariance: np.ndarray) -> np.ndarray:
     """How many of the free parameters the data determine, rather than the prior or the range, ``(pixels,)``.
 
     ``covariance`` is that of the free parameters ``(pixels, free, free)``. With the covariance C and the curvature of
     the prior H the number is ``sum (1 - C_ii H_ii)``; the range of a parameter counts as a weak prior.
     """
-    points = np.stack([np.asarray(getattr(parameters, name)) for name in model.free], axis=-1)
-    curvature = np.nan_to_num(np.asarray(_prior_curvature(model, points), float))
+    curvature = prior_curvature(model, parameters)
     weak = RANGE_CURVATURE / np.array([uniform_std(name) for name in model.free]) ** 2
     variance = np.einsum("...ii->...i", covariance).astype(float)
     return np.sum(np.nan_to_num(np.clip(1 - variance * (curvature + weak), 0, 1)), axis=-1)

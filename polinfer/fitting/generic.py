@@ -24,6 +24,7 @@ from .local_gaussian import Local, describe, equivalent, log_density, uniform_st
 from .newton import maximise
 from .residuals import judge, tail_probability
 from .start import starts
+from .student import total_power, widen
 
 __all__ = ["fit"]
 
@@ -126,6 +127,7 @@ def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics 
         replace = chosen[on_bound[chosen]]
         local.covariance[replace] = edge.moments[: len(chosen)][on_bound[chosen]]
         spread = np.sqrt(np.einsum("...ii->...i", local.covariance[replace]))
+        local.on_bound[replace] = True
         local.unidentified[replace] = spread > 0.5 * np.array([uniform_std(other) for other in model.free])
     return local
 
@@ -293,6 +295,9 @@ def _fit_chunk(
     effective = np.zeros(size)
     if prepared.sigma_unknown:
         effective = effective_parameters(model, best.parameters, local.covariance)
+    if isinstance(model.noise, InferredNoise) and model.noise.integrated:
+        power = total_power(model, model.noise, statistics)
+        local = widen(model, best.parameters, local, effective, power)
     real_type = statistics.residual.dtype
     judged = judge(model, best.parameters, statistics, own, jnp.asarray(effective, real_type))
     status = np.where(best.converged, 0, int(Status.NOT_CONVERGED))

@@ -21,11 +21,18 @@ __all__ = ["Local", "derivatives", "describe", "equivalent", "invert", "log_dens
 
 
 class Local(NamedTuple):
-    """Per pixel: covariance of the free parameters, which of them are not identified, and the log evidence."""
+    """Per pixel: covariance of the free parameters, which of them are not identified, and the log evidence.
+
+    ``curvature`` is the negative Hessian at the maximum, ``rounding`` the precision that it was computed in, and
+    ``on_bound`` says where the covariance is that of a density cut off by a bound.
+    """
 
     covariance: np.ndarray
     unidentified: np.ndarray
     log_evidence: np.ndarray
+    curvature: np.ndarray
+    rounding: float
+    on_bound: np.ndarray
 
 
 def uniform_std(name: str) -> float:
@@ -140,4 +147,5 @@ def describe(model: Model, parameters: Parameters, statistics: Statistics | Wind
     evidence = np.logaddexp.reduce(integral, axis=0)
     result = covariance[0] * width[:, None] * width
     result[~usable[0]] = np.nan
-    return Local(result, unidentified[0], evidence)
+    curvature = np.where(usable[0][:, None, None], -hessian[0], np.nan)
+    return Local(result, unidentified[0], evidence, curvature, eps, np.zeros(len(evidence), bool))
