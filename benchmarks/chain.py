@@ -32,7 +32,7 @@ def main() -> None:
         )
     values = [row["chi_square_per_degree"] for row in results.rows]
     print(f"chi-square per degree of freedom: {min(values):.2f} to {max(values):.2f}, mean {np.mean(values):.2f}")
-    results.save("seconds", "chi_square_per_degree", "seed")
+    results.save(results.lines("seconds", "chi_square_per_degree", "seed"))
 
 
 if __name__ == "__main__":

@@ -1,39 +1,75 @@
-"""Timing, and where results go: a printed table, JSON beside it, and a picture of error against time."""
+"""Timing, bars, fresh processes, and where results go: a printed table, JSON beside it, and a picture."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FOLDER = Path(__file__).parent / "results"
 
 
-def median_seconds(function: Callable[[], Any], repeats: int = 5) -> float:
-    """Median wall time of a call whose result is NumPy (so it is finished), after one call that is not counted."""
+def seconds(function: Callable[[], Any]) -> float:
+    """Wall time of one call whose result is NumPy (so it is finished)."""
+    start = time.perf_counter()
     function()
-    times = []
+    return time.perf_counter() - start
+
+
+def alternating_seconds(functions: dict[str, Callable[[], Any]], repeats: int = 5) -> dict[str, np.ndarray]:
+    """Wall times of several functions that take turns, so that a slow spell of the machine hits all of them."""
+    times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+        for name, function in functions.items():
+            times[name].append(seconds(function))
+    return {name: np.array(values) for name, values in times.items()}
+
+
+def median_seconds(function: Callable[[], Any], repeats: int = 5) -> float:
+    """Median wall time of a call, after one call that is not counted."""
+    function()
+    return float(np.median([seconds(function) for _ in range(repeats)]))
+
+
+def in_fresh_process(function: Callable[..., Any], *arguments: Any, double: bool) -> Any:
+    """``function(*arguments)`` in a process of its own, without compiled code, in one precision of JAX.
+
+    Arguments and result travel as JSON.
+    """
+    code = (
+        f"import json\nfrom {function.__module__} import {function.__name__} as f\n"
+        f"print('\\n' + json.dumps(f(*json.loads({json.dumps(json.dumps(arguments))}))))"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    environment["JAX_ENABLE_X64"] = str(int(double))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[1]
+    )
+    if done.returncode:
+        raise RuntimeError(f"{function.__name__}{arguments} failed:\n{done.stderr}")
+    return json.loads(done.stdout.rstrip().rsplit("\n", 1)[-1])
 
 
 def machine() -> dict[str, str]:
     """What the figures were measured on."""
     versions = {name: metadata.version(name) for name in ("polinfer", "numpy", "scipy", "jax")}
+    model = [line.split(":")[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
     return {
-        "processor": platform.processor() or platform.machine(),
+        "processor": (model or [platform.processor() or platform.machine()])[0],
         "cores": str(os.cpu_count()),
         "python": platform.python_version(),
         "date": datetime.now(UTC).date().isoformat(),
@@ -41,36 +77,59 @@ def machine() -> dict[str, str]:
     }
 
 
+def _lines(path: str) -> list[str]:
+    return Path(path).read_text().splitlines() if Path(path).exists() else []
+
+
 @dataclass
 class Results:
-    """Rows of one benchmark."""
+    """Rows and bars of one benchmark."""
 
     name: str
     rows: list[dict[str, Any]] = field(default_factory=list)
+    bars: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        print(f"\n== {self.name}: " + ", ".join(f"{k} {v}" for k, v in machine().items()))
 
     def add(self, **row: Any) -> None:
-        """Add a row and print it."""
-        if not self.rows:
-            print(f"\n== {self.name}: {machine()}")
-            print(" | ".join(f"{key:>22s}" for key in row))
+        """Add a row and print it, below its column names if they are new."""
+        widths = {key: max(len(key), 9) for key in row}
+        if not self.rows or list(self.rows[-1]) != list(row):
+            print("\n" + " | ".join(f"{key:>{width}s}" for key, width in widths.items()))
         self.rows.append(row)
-        print(" | ".join(f"{v:22.4g}" if isinstance(v, float) else f"{v!s:>22s}" for v in row.values()))
+        texts = ((f"{v:.4g}" if isinstance(v, float) else str(v)) for v in row.values())
+        print(" | ".join(f"{text:>{width}s}" for text, width in zip(texts, widths.values(), strict=True)), flush=True)
 
-    def save(self, x: str, y: str, group: str) -> None:
-        """Write JSON and a picture of y against x, a line for each value of ``group``."""
-        from matplotlib.figure import Figure
+    def bar(self, claim: str, measured: float, bar: float, unit: str = "", at_least: bool = False) -> None:
+        """Print a figure beside its bar; NaN misses."""
+        held = bool(measured >= bar if at_least else measured <= bar)
+        self.bars.append(
+            {"claim": claim, "measured": float(measured), "bar": float(bar), "unit": unit, "at_least": at_least}
+        )
+        sign = ">=" if at_least else "<="
+        print(f"  [{'pass' if held else 'MISS'}] {claim}: {measured:.5g} {unit} (bar {sign} {bar:g})", flush=True)
 
+    def save(self, figure: Figure | None = None) -> None:
+        """Write JSON, and the picture if there is one."""
         FOLDER.mkdir(exist_ok=True)
         path = FOLDER / f"{self.name}.json"
-        path.write_text(json.dumps({"machine": machine(), "rows": self.rows}, indent=1))
+        path.write_text(json.dumps({"machine": machine(), "bars": self.bars, "rows": self.rows}, indent=1))
+        if figure is not None:
+            figure.savefig(path.with_suffix(".png"), dpi=120)
+        print(f"wrote {path}" + (f" and {path.with_suffix('.png').name}" if figure is not None else ""))
+
+    def lines(self, x: str, y: str, group: str) -> Figure:
+        """A picture of y against x, a line for each value of ``group``."""
+        from matplotlib.figure import Figure
+
         figure = Figure(figsize=(6, 4), layout="constrained")
         axes = figure.subplots()
-        for value in dict.fromkeys(row[group] for row in self.rows):
-            rows = [row for row in self.rows if row[group] == value]
+        for value in dict.fromkeys(row[group] for row in self.rows if group in row):
+            rows = [row for row in self.rows if row.get(group) == value]
             axes.loglog([row[x] for row in rows], [row[y] for row in rows], "o-", label=str(value))
-        axes.set_xlabel(x)
-        axes.set_ylabel(y)
+        axes.set_xlabel(x.replace("_", " "))
+        axes.set_ylabel(y.replace("_", " "))
         axes.legend(fontsize=8)
         axes.grid(alpha=0.3)
-        figure.savefig(path.with_suffix(".png"), dpi=120)
-        print(f"wrote {path} and {path.with_suffix('.png')}")
+        return figure

@@ -59,7 +59,7 @@ def main() -> None:
                 relative_error=float(np.median(errors)),
                 fft_pairs_of_all_planes=seconds / pair_seconds,
             )
-    results.save("seconds_a_field", "relative_error", "photons_at_peak")
+    results.save(results.lines("seconds_a_field", "relative_error", "photons_at_peak"))
 
 
 if __name__ == "__main__":
