@@ -169,8 +169,9 @@ def pool(summary: Summary, window: Window | None, gain: Gain, noise: Noise) -> P
 
     Notes
     -----
-    The residual of a window is a difference of sums in float64, ``sum |Y_i|^2 - |Y|^2``: it is good to 1e-5 nat at a
-    signal-to-noise ratio of 1e4 and to 0.1 nat at 1e6.
+    The residual of a window is a difference of sums in float64, ``sum |Y_i|^2 - |Y|^2``, as long as this keeps 1e-3 nat
+    (signal-to-noise ratios up to about 3e4, less in large windows). Beyond, the pixels of the window are added up one
+    by one, which takes as long as the window is large.
     """
     shape = summary.masked.shape
     usable = ~(summary.masked | summary.non_finite)
@@ -199,7 +200,8 @@ def pool(summary: Summary, window: Window | None, gain: Gain, noise: Noise) -> P
     if known and isinstance(gain, UnitGain):
         total = _sums(own, window, shape, pixels, root)
         return Pooled(lambda chosen: Statistics(*(x[chosen] for x in total)), own, pixels, data, rank)
-    if known and isinstance(gain, ComplexGain) and root is not None and window.rows * window.columns > 4:
+    exact = not _is_strong(own, window, shape)
+    if known and isinstance(gain, ComplexGain) and root is not None and exact and window.rows * window.columns > 4:
         take = _moments(own, window, shape, pixels, root)
     else:
         take = _members(own, window, shape)
@@ -209,6 +211,12 @@ def pool(summary: Summary, window: Window | None, gain: Gain, noise: Noise) -> P
 def _frame(values: np.ndarray, shape: tuple[int, ...], window: Window, trailing: int) -> np.ndarray:
     tail = values.shape[1:]
     return box_sum(values.reshape(shape + tail), window, trailing).reshape(-1, *tail)
+
+
+def _is_strong(own: Statistics, window: Window, shape: tuple[int, ...]) -> bool:
+    """Whether sums of squares over a window would lose more than about 1e-4 nat to rounding."""
+    power = _frame(_power(own.response), shape, window, 0)
+    return bool(np.max(power, initial=0) * np.finfo(float).eps > 1e-5)
 
 
 def _power(values: np.ndarray) -> np.ndarray:
@@ -232,7 +240,10 @@ def _sums(
         gram = _frame(own.illumination.astype(np.complex128) @ adjoint, shape, window, 2)
         cross = _frame(own.response.astype(np.complex128) @ adjoint, shape, window, 2)
         illumination, response = _solve(gram, cross)
-    spread = np.maximum(power - _power(response), 0)
+    if _is_strong(own, window, shape):
+        spread = _spread(own, window, shape, Statistics(illumination, response, residual, constant, count))
+    else:
+        spread = np.maximum(power - _power(response), 0)
     return Statistics(
         illumination.astype(complex_type),
         response.astype(complex_type),
@@ -240,6 +251,19 @@ def _sums(
         (constant - spread).astype(real_type),
         count.astype(real_type),
     )
+
+
+def _spread(own: Statistics, window: Window, shape: tuple[int, ...], total: Statistics) -> np.ndarray:
+    """``sum |Y_i - Jhat R_i|^2`` over every window, formed directly."""
+    rows, columns = plane(shape)
+    matrices = least_squares_jones(total).reshape(-1, rows, columns, 2, 2)
+    response, illumination = (x.reshape(-1, rows, columns, 2, 2) for x in (own.response, own.illumination))
+    spread = np.zeros(matrices.shape[:3])
+    for y, x in window.offsets(shape):
+        here = (slice(None), slice(max(-y, 0), rows - max(y, 0)), slice(max(-x, 0), columns - max(x, 0)))
+        there = (slice(None), slice(max(y, 0), rows - max(-y, 0)), slice(max(x, 0), columns - max(-x, 0)))
+        spread[here] += _power(response[there] - matrices[here] @ illumination[there])
+    return spread.reshape(-1)
 
 
 def _solve(gram: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

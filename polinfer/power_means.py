@@ -60,7 +60,9 @@ def log_gain_mean(power: Any, rest: Any, signal: Any, width: Any) -> jax.Array:
     still = [jax.lax.stop_gradient(x) for x in (power, rest, signal, width)]
     first, second = _peak(0, *still), _peak(1, *still)
     nodes = jnp.asarray(GAIN_NODES, jnp.result_type(float, rest, signal, width))
-    scale = jnp.log1p(rest) - jnp.log(power)
+    # the reference is constant too: its derivatives would cancel those of the peak where they are large
+    fixed = still[1]
+    scale = jnp.log1p(fixed) - jnp.log(power)
     parts = []
     for own, other in ((first, second), (second, first)):
         place = own[0] + own[1] * jnp.sinh(STRETCH * nodes) / STRETCH
@@ -69,11 +71,12 @@ def log_gain_mean(power: Any, rest: Any, signal: Any, width: Any) -> jax.Array:
         share = -jnp.logaddexp(0.0, SEPARATION * (_distance(place, own) - _distance(place, other)))
         offset = place - scale
         variance = jnp.exp(place)
-        exponent = -power * (offset + jnp.expm1(-offset)) - signal / (width + variance) - jnp.log1p(width / variance)
+        exponent = -power * (offset + jnp.expm1(-offset)) - (rest - fixed) / variance
+        exponent = exponent - signal / (width + variance) - jnp.log1p(width / variance)
         parts.append(exponent + weight + share)
     total = logsumexp(jnp.concatenate(parts, axis=-1), axis=-1)
-    power, rest = power[..., 0], rest[..., 0]
-    return -power * jnp.log1p(rest) + _log_gamma_peak(power) + total
+    power, fixed = power[..., 0], fixed[..., 0]
+    return -power * jnp.log1p(fixed) + _log_gamma_peak(power) + total
 
 
 def _distance(place: jax.Array, peak: tuple[jax.Array, jax.Array]) -> jax.Array:
