@@ -1,12 +1,24 @@
 """What is saved comes back the same, and nothing foreign is believed."""
 
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 
 import polinfer
-from polinfer import ComplexGain, Measurement, Model, PhaseGain, PolariserFirst, UniformAngle, VonMises, phantoms
+from polinfer import (
+    ComplexGain,
+    InferredNoise,
+    KnownNoise,
+    Measurement,
+    Model,
+    PhaseGain,
+    PolariserFirst,
+    UniformAngle,
+    VonMises,
+    Window,
+    phantoms,
+)
 from polinfer.priors import Prior
 
 
@@ -36,7 +48,7 @@ def measurement(dtype=np.complex128):
 
 def fitted(model):
     data = measurement()
-    return polinfer.fit(model, data)
+    return polinfer.fit(model, data if isinstance(model.noise, KnownNoise) else replace(data, sigma=None))
 
 
 RECORDS = {
@@ -47,6 +59,7 @@ RECORDS = {
     "fit": lambda: fitted(Model(gain=ComplexGain(2.0), priors={"circularity": VonMises(0.5, 2.0)})),
     "fit, fixed": lambda: fitted(Model(PolariserFirst(), gain=PhaseGain(), fixed={"diattenuation": 0.0},
                                        priors={"retardance": UniformAngle(2 * np.pi)})),
+    "fit, unknown noise": lambda: fitted(Model(noise=InferredNoise(2.0, 0.1, "frame"), neighbours=Window(1, 3))),
 }  # fmt: skip
 
 
