@@ -234,8 +234,12 @@ class Fit:
         """The fit as a labelled :class:`xarray.Dataset`: ``parameters.retardance``, ``std.retardance``, with units."""
         return storage.to_dataset(self)
 
-    def plot(self) -> Figure:
-        """Maps of the parameters with their uncertainty below, see :func:`polinfer.plots.plot_fit`."""
+    def plot(self, smooth: bool = False, pixel_size: float | None = None) -> Figure:
+        """Maps of the parameters with their uncertainty below, see :func:`polinfer.plots.plot_fit`.
+
+        ``smooth`` shows the equivalent parameters that :func:`polinfer.smooth_gauge` chooses, ``pixel_size`` (metres)
+        adds a scale bar.
+        """
         from .plots import plot_fit
 
-        return plot_fit(self)
+        return plot_fit(self, smooth=smooth, pixel_size=pixel_size)

@@ -12,6 +12,16 @@ from .options import PATH, declared_model, model_options, overwrite_option, vaca
 __all__ = ["fit_command"]
 
 
+def _middle(values: Any, period: float) -> tuple[str, float]:
+    """What kind of middle, and the middle of the values that are known: one that has no trouble with the wrap."""
+    import numpy as np
+
+    if np.isinf(period):
+        return "median", float(np.nanmedian(values))
+    turn = period / (2 * np.pi)
+    return "circular mean", float(turn * np.angle(np.nanmean(np.exp(1j * np.asarray(values, float) / turn))))
+
+
 @click.command("fit")
 @click.argument("measurement", type=PATH)
 @click.argument("out", type=PATH)
@@ -49,8 +59,7 @@ def fit_command(
 
     from .. import files, storage
     from ..fitting import fit
-    from ..plots import plot_fit
-    from ..records import Measurement, Parameters, Status
+    from ..records import PERIODS, Measurement, Parameters, Status
 
     if picture is None and (smooth is not None or pixel_size is not None):
         raise click.UsageError("the gauge and --pixel-size are only for --picture.")
@@ -66,7 +75,7 @@ def fit_command(
     storage.save(result, out, overwrite=overwrite)
     if picture is not None:
         size = None if pixel_size is None else pixel_size * 1e-6
-        plot_fit(result, smooth=bool(smooth), pixel_size=size).savefig(picture)
+        result.plot(smooth=bool(smooth), pixel_size=size).savefig(picture)
     click.echo(f"{result.status.size} pixels, {int(np.sum(result.status == 0))} OK")
     for flag in Status:
         count = int(np.sum((result.status & int(flag)) != 0))
@@ -76,7 +85,9 @@ def fit_command(
         values, widths = getattr(result.parameters, name), getattr(result.std, name)
         if np.isfinite(widths).any():
             scale, unit = (1.0, "") if name == "diattenuation" else (180 / np.pi, " degrees")
-            middle, width = (scale * float(np.nanmedian(x)) for x in (values, widths))
-            click.echo(f"  {name}: median {middle:.4g}, median standard deviation {width:.2g}{unit}")
+            period = float("inf") if name in model.bounds else getattr(PERIODS, name)
+            kind, middle = _middle(values, period)
+            width = scale * float(np.nanmedian(widths))
+            click.echo(f"  {name}: {kind} {scale * middle:.4g}, median standard deviation {width:.2g}{unit}")
     if declared["infer_noise"] is not None and np.isfinite(result.sigma).any():
         click.echo(f"  sigma: median {float(np.nanmedian(result.sigma)):.4g}")

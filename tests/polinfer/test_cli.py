@@ -5,7 +5,7 @@ import pytest
 from click.testing import CliRunner
 
 import polinfer
-from polinfer import ComplexGain, Measurement, Model, PolariserFirst, phantoms
+from polinfer import ComplexGain, Fit, Measurement, Model, Parameters, PolariserFirst, phantoms
 from polinfer.cli import main
 from tests.oracles import jones as oracle
 
@@ -64,6 +64,69 @@ def test_options_declare_the_model_in_degrees_and_fit_gets_it(monkeypatch, measu
     assert model == Model(noise=polinfer.InferredNoise(2.0, 0.002, "frame"))
     assert data.sigma is None
     assert "sigma of the measurement is not used" in run("fit", measurement, out, *noise).output
+
+
+ANGLES = Parameters(
+    diattenuation=np.array([0.2, -0.6, 0.7, np.nan]),
+    diattenuation_angle=np.array([85.0, -88.0, 89.0, np.nan]),  # on both sides of 90
+    retardance=np.array([170.0, -175.0, -178.0, np.nan]),
+    retardance_angle=np.array([40.0, 42.0, 70.0, np.nan]),
+    circularity=np.array([-20.0, 10.0, 30.0, np.nan]),
+)
+
+
+def fit_of_angles(model, data, progress):
+    """Stands in for ``fit``: ANGLES in degrees, widths of 0.1, three pixels in order."""
+    radians = Parameters(ANGLES[0], *(np.radians(x) for x in ANGLES[1:]))
+    flat = np.ones(4)
+    return Fit(model, radians, Parameters(*(0.1 * flat,) * 5), np.ones((4, 5, 5)), flat, flat, flat, None,
+               np.array([0, 0, 0, 1]), flat, flat)  # fmt: skip
+
+
+@pytest.mark.parametrize("gain", ["none", "phase"])
+def test_angles_are_summarised_across_the_wrap_and_a_bounded_retardance_is_not(
+    gain, monkeypatch, measurement, tmp_path
+):
+    monkeypatch.setattr("polinfer.fitting.fit", fit_of_angles)
+    result = run("fit", measurement, tmp_path / "out.nc", "--gain", gain)
+    assert result.exit_code == 0, result.output
+    told = dict(line.strip().split(": ") for line in result.output.splitlines() if "standard deviation" in line)
+    grid = np.linspace(-180, 180, 36001)
+    for name, period in (("diattenuation_angle", 180), ("retardance", 360), ("retardance_angle", 180),
+                         ("circularity", 360)):  # fmt: skip
+        if gain == "none" and name == "retardance":
+            continue
+        # the circular mean is the angle from which the mean cosine is largest
+        values = getattr(ANGLES, name)[:3]
+        best = grid[np.cos(2 * np.pi * (grid[:, None] - values) / period).sum(axis=1).argmax()]
+        kind, number = told[name].split(", ")[0].rsplit(" ", 1)
+        assert kind == "circular mean"
+        assert abs((float(number) - best + period / 2) % period - period / 2) < 0.06
+        assert told[name].endswith("median standard deviation 5.7 degrees")
+    assert told["diattenuation"] == "median 0.2, median standard deviation 0.1"
+    if gain == "none":
+        assert told["retardance"].startswith("median -175,")
+
+
+@pytest.mark.parametrize(
+    ("options", "smooth", "size"), [([], False, None), (["--smooth-gauge", "--pixel-size", "9"], True, 9e-6)]
+)
+def test_the_picture_has_the_gauge_and_the_scale_that_are_asked_for(
+    options, smooth, size, monkeypatch, measurement, tmp_path
+):
+    from matplotlib.figure import Figure
+
+    seen = []
+
+    def draw(fit, smooth, pixel_size):
+        seen.append((fit.status.tolist(), smooth, pixel_size))
+        return Figure()
+
+    monkeypatch.setattr("polinfer.fitting.fit", fit_of_angles)
+    monkeypatch.setattr("polinfer.plots.plot_fit", draw)
+    result = run("fit", measurement, tmp_path / "out.nc", "--picture", tmp_path / "map.png", *options)
+    assert result.exit_code == 0, result.output
+    assert seen == [([0, 0, 0, 1], smooth, size if size is None else pytest.approx(size))]
 
 
 @pytest.mark.parametrize(
