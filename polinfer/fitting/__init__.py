@@ -1,5 +1,5 @@
 """From a model and a measurement to the most probable parameters and their uncertainty."""
 
-from .generic import fit
+from .frames import fit
 
 __all__ = ["fit"]

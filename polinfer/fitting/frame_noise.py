@@ -1,9 +1,10 @@
 """One unknown sigma for all pixels of a frame: how it follows from fits at a given sigma.
 
-The density of log sigma^2 is the product of the evidences of all pixels (Laplace) and of the inverse gamma prior. With
+The density of log sigma^2 is the product of the evidences of all pixels and of the inverse gamma prior. With
 ``s = sigma^2``, the residuals Q_i, the numbers N_i of complex data and the effective numbers gamma_i of real parameters
-that the data determine, its derivative vanishes at ``s = (scale + sum Q_i) / (shape + sum (N_i - gamma_i / 2))``. A
-window makes every datum count several times; the sums are divided by that number, so that the prior keeps its weight.
+that the data determine, the Gaussian approximation of the evidences puts its maximum at
+``s = (scale + sum Q_i) / (shape + sum (N_i - gamma_i / 2))``. A window makes every datum count several times; the sums
+are divided by that number, so that the prior keeps its weight.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from ..neighbours import Windowed
 from ..noise import InferredNoise
 from ..records import PERIODS, Parameters
 from ..statistics import Statistics
-from .local_gaussian import RANGE_CURVATURE, uniform_std
 
 __all__ = ["Search", "effective_parameters", "misfit", "prior_curvature"]
 
@@ -68,16 +68,17 @@ def prior_curvature(model: Model, parameters: Parameters) -> np.ndarray:
     return np.nan_to_num(np.asarray(_prior_curvature(model, points), float), posinf=0.0, neginf=0.0)
 
 
-def effective_parameters(model: Model, parameters: Parameters, covariance: np.ndarray) -> np.ndarray:
-    """How many of the free parameters the data determine, rather than the prior or the range, ``(pixels,)``.
+def effective_parameters(model: Model, parameters: Parameters, covariance: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """How many of the free parameters the data determine, rather than the prior, ``(pixels,)``.
 
-    ``covariance`` is that of the free parameters ``(pixels, free, free)``. With the covariance C and the curvature of
-    the prior H the number is ``sum (1 - C_ii H_ii)``; the range of a parameter counts as a weak prior.
+    ``covariance`` is that of the free parameters ``(pixels, free, free)``, ``most`` how many real numbers the data can
+    determine. With the covariance C and the curvature of the prior H the number is ``sum (1 - C_ii H_ii)``. An angle
+    without a prior counts fully even if it is unknown: near the pole of polar coordinates, the fit follows the noise
+    in all directions.
     """
-    curvature = prior_curvature(model, parameters)
-    weak = RANGE_CURVATURE / np.array([uniform_std(name) for name in model.free]) ** 2
     variance = np.einsum("...ii->...i", covariance).astype(float)
-    return np.sum(np.nan_to_num(np.clip(1 - variance * (curvature + weak), 0, 1)), axis=-1)
+    share = np.clip(1 - np.nan_to_num(variance) * prior_curvature(model, parameters), 0, 1)
+    return np.minimum(np.sum(share, axis=-1), most)
 
 
 class Search:

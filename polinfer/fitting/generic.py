@@ -1,38 +1,33 @@
-"""``fit`` for any ordering and any priors."""
+"""A chunk of pixels of any model: any ordering, any priors, any window, unknown noise."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..checks import one_of_types
 from ..degeneracy import REFERENCE, nearest, reduce_ranges
 from ..model import Model, as_device
 from ..neighbours import Pooled, Windowed
-from ..noise import InferredNoise, KnownNoise
-from ..records import Fit, Measurement, Parameters, Status
-from ..statistics import Statistics, Summary, least_squares_jones, summarise
+from ..noise import InferredNoise
+from ..records import Measurement, Parameters, Status
+from ..statistics import Statistics, Summary, summarise
 from .charts import from_parameters, to_parameters
 from .edges import integrate
-from .frame_noise import Search, effective_parameters, first_guess, misfit
+from .frame_noise import effective_parameters, misfit
 from .local_gaussian import Local, describe, equivalent, log_density, uniform_std
 from .newton import maximise
-from .residuals import judge, tail_probability
+from .residuals import judge
 from .start import starts
 from .student import total_power, widen
 
-__all__ = ["fit"]
+__all__ = ["DESIGN", "DESIGN_WARM", "Part", "Prepared", "chunk_size", "fit_chunk", "prepare"]
 
 CHUNK = 2048  # pixels whose starting points are in memory at once
 ITERATIONS = 60
 DESIGN, DESIGN_WARM = 6, 2  # starts from the design, without and with an earlier fit
-FRAME_ROUNDS = 30
-BAD_FIT_PROBABILITY = 1e-3
 
 
 class _Best(NamedTuple):
@@ -132,158 +127,51 @@ def _correct_edges(model: Model, parameters: Parameters, statistics: Statistics 
     return local
 
 
-def fit(model: Model, measurement: Measurement, start: Fit | None = None, progress: bool = False) -> Fit:
-    """The most probable parameters of every pixel, with a local Gaussian around them.
+class Prepared(NamedTuple):
+    """A measurement made ready: its statistics, and the flat indices ``good`` of the pixels that can be fitted.
 
-    Maximises ``log p(data | parameters) + log p(parameters)``, the density in D, theta_D, eta, theta_eta, xi (radians),
-    with the gain integrated out; every pixel (or the window around it) on its own, by Newton steps from several starts.
-    Of the equivalent parameter sets with the highest density the canonical one is reported
-    (:func:`polinfer.canonicalise`). Nothing is random. The precision is that of the measurement: complex64 data give
-    float32 results; complex128 data give float64 results where JAX has double precision enabled
-    (``jax.config.update("jax_enable_x64", True)``), else float32.
-
-    Parameters
-    ----------
-    model: the scene. measurement: the data, pixel shape P; it must know sigma unless the model infers it.
-    start: an earlier fit of the same pixel shape and similar data (a video): its parameters are tried first and fewer
-        other starts are needed.
-    progress: show a progress bar.
-
-    Returns
-    -------
-    Fit, arrays of shape P. Masked pixels and those with a response that is not finite are NaN and flagged.
-
-    Raises
-    ------
-    ValueError: no sigma, or one that is to be inferred, a start of another shape, nothing free to fit. TypeError:
-    arguments of a wrong kind.
-
-    Notes
-    -----
-    Standard deviations come from the curvature at the maximum. On a bound (``Status.AT_EDGE``) the density is not a
-    Gaussian there.
-
-    With ``InferredNoise`` of scope "frame" the most probable sigma of the frame is found first by repeated fits, as the
-    maximum of the density of log sigma^2 with the parameters integrated out (Laplace); all else is given this sigma.
-
-    Source: Gordon et al., supplementary information, inference of polarimetric parameters; Laplace approximation.
-
-    >>> import polinfer
-    >>> truth = polinfer.Parameters(0.3, 0.5, 1.2, 0.4, 0.2)
-    >>> states = np.array([[1, 1, 1], [1, 1j, -1]]) / 2**0.5
-    >>> data = polinfer.simulate(polinfer.Model(), truth, states, sigma=0.01, rng=1)
-    >>> result = polinfer.fit(polinfer.Model(), data)
-    >>> int(result.status), bool(abs(result.parameters.retardance - 1.2) < 5 * result.std.retardance)
-    (0, True)
+    ``most`` is how many real numbers the data of a pixel can determine beside the gains.
     """
-    one_of_types("model", model, (Model,), "pass Model(...).")
-    one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
-    shape = measurement.shape
-    if start is not None:
-        one_of_types("start", start, (Fit,), "pass an earlier Fit or None.")
-        if start.status.shape != shape:
-            raise ValueError(f"start has pixel shape {start.status.shape} and measurement {shape}; they must agree.")
-    if not model.free:
-        raise ValueError("model has no free parameter to fit; fix fewer of them.")
-    earlier = None
-    if start is not None:
-        earlier = Parameters(*(np.asarray(x).reshape(-1) for x in start.parameters))
-    if isinstance(model.noise, InferredNoise) and not model.noise.integrated:
-        return _fit_frame(model, model.noise, measurement, earlier, progress)
-    prepared = _prepare(model, measurement, model.noise.integrated)
-    parts = list(_parts(prepared, earlier, DESIGN if earlier is None else DESIGN_WARM, progress))
-    return _assemble(model, prepared, model.noise.sigma(measurement), parts, start is not None)
 
-
-class _Prepared(NamedTuple):
     model: Model
     measurement: Measurement
     summary: Summary
     pooled: Pooled
     good: np.ndarray
+    most: np.ndarray
     sigma_unknown: bool
 
 
-class _Part(NamedTuple):
+class Part(NamedTuple):
+    """Results of some pixels by name, their covariance ``(pixels, 5, 5)`` and their status."""
+
     values: dict[str, np.ndarray]
     covariance: np.ndarray
     status: np.ndarray
 
 
-def _prepare(model: Model, measurement: Measurement, sigma_unknown: bool) -> _Prepared:
+def prepare(model: Model, measurement: Measurement, sigma_unknown: bool) -> Prepared:
+    """Statistics of a measurement, of windows where the model has them."""
     summary = summarise(measurement, model.noise.sigma(measurement))
     good = np.flatnonzero(~(summary.masked | summary.non_finite).reshape(-1))
-    return _Prepared(model, measurement, summary, model.pool(summary), good, sigma_unknown)
+    pooled = model.pool(summary)
+    most = np.maximum(4 * pooled.rank - model.known_gain.real_parameters * pooled.pixels, 0).reshape(-1)
+    return Prepared(model, measurement, summary, pooled, good, most, sigma_unknown)
 
 
-def _parts(prepared: _Prepared, earlier: Parameters | None, design: int | None, progress: bool) -> Iterable[_Part]:
-    """Fits of all good pixels, chunk by chunk; ``earlier`` are parameters of all pixels."""
-    model, pooled, good = prepared.model, prepared.pooled, prepared.good
+def chunk_size(model: Model) -> int:
+    """Number of pixels that :func:`fit_chunk` takes at once."""
     # the starting points of a window take its size in memory, those of an integral over sigma the number of its nodes
     cost = 1 if model.neighbours is None else model.neighbours.rows * model.neighbours.columns
     cost *= 8 if model.noise.integrated else 1
-    size = max(CHUNK // cost, 64)
-    chunks: Any = range(0, len(good), size)
-    if progress:
-        from tqdm import tqdm
-
-        chunks = tqdm(chunks, desc="fit", unit="chunk")
-    for begin in chunks:
-        chosen = good[begin : begin + size]
-        known = None if earlier is None else Parameters(*(x[chosen] for x in earlier))
-        own = Statistics(*(x[chosen] for x in pooled.own))
-        yield _fit_chunk(prepared, pooled.take(chosen), own, known, design)
+    return max(CHUNK // cost, 64)
 
 
-def _fit_frame(
-    model: Model, noise: InferredNoise, measurement: Measurement, earlier: Parameters | None, progress: bool
-) -> Fit:
-    """Fit with one unknown sigma for all pixels."""
-    noise.refuse(measurement)
-    given = replace(model, noise=KnownNoise())
-
-    def at(variance: float) -> _Prepared:
-        return _prepare(given, replace(measurement, sigma=np.sqrt(variance)), True)
-
-    unit = at(1.0)
-    own = Statistics(*(x[unit.good] for x in unit.pooled.own))
-    closed = model.ordering.decompose(least_squares_jones(own))
-    search = Search(noise, first_guess(noise, own, None if closed is None else np.asarray(given.jones(closed))))
-    warm = earlier
-    design: int | None = DESIGN if earlier is None else DESIGN_WARM
-    for _ in range(FRAME_ROUNDS if len(unit.good) else 0):
-        prepared = at(search.variance)
-        parts = list(_parts(prepared, warm, design, progress))
-        misfits, fitted = (np.concatenate([part.values[name] for part in parts]) for name in ("misfit", "effective"))
-        data = prepared.pooled.data.reshape(-1)[prepared.good]
-        copies = float(np.sum(data)) / max(float(np.sum(own.count)), 1.0)
-        search.update(misfits, data, fitted, copies)
-        warm, design = _spread_parameters(prepared, parts), None
-        if search.converged:
-            break
-    final = at(search.variance)
-    parts = list(_parts(final, warm, DESIGN_WARM, progress))
-    return _assemble(model, final, np.full(measurement.shape, np.sqrt(search.variance)), parts, earlier is not None)
-
-
-def _spread_parameters(prepared: _Prepared, parts: list[_Part]) -> Parameters:
-    """Parameters of all pixels, NaN where there is no fit."""
-    found = {}
-    for name in Parameters._fields:
-        values = [part.values[name] for part in parts]
-        found[name] = np.full(prepared.summary.masked.size, np.nan, values[0].dtype)
-        found[name][prepared.good] = np.concatenate(values)
-    return Parameters(**found)
-
-
-def _fit_chunk(
-    prepared: _Prepared,
-    host: Statistics | Windowed,
-    own: Statistics,
-    earlier: Parameters | None,
-    design: int | None,
-) -> _Part:
-    model, dtype, count = prepared.model, prepared.measurement.response.dtype, len(own.count)
+def fit_chunk(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None, design: int | None) -> Part:
+    """Maximum, Gaussian, evidence and residuals of the pixels ``chosen``; ``earlier`` are their parameters."""
+    model, dtype, count = prepared.model, prepared.measurement.response.dtype, len(chosen)
+    host: Statistics | Windowed = prepared.pooled.take(chosen)
+    own = Statistics(*(x[chosen] for x in prepared.pooled.own))
     # code is compiled for a shape: pad to a power of two, so that few shapes occur
     size = 1 << (count - 1).bit_length()
     fill = np.concatenate([np.arange(count), np.zeros(size - count, int)])
@@ -294,7 +182,7 @@ def _fit_chunk(
     local = _correct_edges(model, best.parameters, statistics, describe(model, best.parameters, statistics))
     effective = np.zeros(size)
     if prepared.sigma_unknown:
-        effective = effective_parameters(model, best.parameters, local.covariance)
+        effective = effective_parameters(model, best.parameters, local.covariance, prepared.most[chosen][fill])
     if isinstance(model.noise, InferredNoise) and model.noise.integrated:
         power = total_power(model, model.noise, statistics)
         local = widen(model, best.parameters, local, effective, power)
@@ -318,58 +206,4 @@ def _fit_chunk(
     if prepared.sigma_unknown and not model.noise.integrated:
         values["misfit"] = np.asarray(misfit(model, best.parameters, statistics), float)
     values["log_evidence"] = local.log_evidence.astype(real_type)
-    return _Part({name: x[:count] for name, x in values.items()}, covariance[:count], status[:count])
-
-
-def _assemble(model: Model, prepared: _Prepared, sigma: np.ndarray | None, parts: list[_Part], started: bool) -> Fit:
-    """Put the chunks back into the frame, and judge the residuals; ``sigma`` None: that of the parts."""
-    summary, pooled, good = prepared.summary, prepared.pooled, prepared.good
-    shape = prepared.measurement.shape
-    real_type = parts[0].covariance.dtype if parts else np.dtype(float)
-
-    def spread(values: list[np.ndarray], dtype: np.dtype | type, tail: tuple[int, ...] = ()) -> np.ndarray:
-        frame = np.full((int(np.prod(shape)), *tail), np.nan, dtype)
-        if values:
-            frame[good] = np.concatenate(values)
-        return frame.reshape((*shape, *tail))
-
-    def value(name: str, dtype: np.dtype | type = real_type) -> np.ndarray:
-        return spread([part.values[name] for part in parts], dtype)
-
-    covariance = spread([part.covariance for part in parts], real_type, (5, 5))
-    with np.errstate(invalid="ignore"):
-        std = np.sqrt(np.einsum("...ii->...i", covariance))
-    for name in model.dropped:
-        std[..., Parameters._fields.index(name)] = np.nan
-    status = np.zeros(int(np.prod(shape)), np.int32)
-    if parts:
-        status[good] = np.concatenate([part.status for part in parts])
-    status = status.reshape(shape)
-    status = np.where(summary.non_finite, int(Status.NON_FINITE), status)
-    status = np.where(summary.masked, int(Status.MASKED), status).astype(np.int32)
-    gains = model.known_gain.real_parameters
-    fitted = np.minimum(len(model.free) + gains * pooled.pixels, 4 * pooled.rank)
-    degrees = np.maximum(2 * pooled.data - fitted, 0).astype(np.int32)
-    own = np.broadcast_to(pooled.own.count, (status.size,)).reshape(shape)
-    share = np.minimum(len(model.free) * own / np.maximum(pooled.data, 1) + gains, 4 * summary.rank)
-    chi_square = value("chi_square")
-    likely = tail_probability(model, chi_square, degrees, value("residual"), 2 * own - share)
-    status = np.where(likely < BAD_FIT_PROBABILITY, status | int(Status.BAD_FIT), status).astype(np.int32)
-    if sigma is None:
-        with np.errstate(divide="ignore"):
-            sigma = value("precision") ** -0.5
-    complex_type = np.result_type(real_type, np.complex64)
-    return Fit(
-        model=model,
-        parameters=Parameters(*(value(name) for name in Parameters._fields)),
-        std=Parameters(*(std[..., i] for i in range(5))),
-        covariance=covariance,
-        log_posterior=value("log_posterior"),
-        log_evidence=value("log_evidence"),
-        sigma=np.array(sigma, real_type),
-        gain=None if model.gain is None else value("gain", complex_type),
-        status=status,
-        chi_square=chi_square,
-        degrees_of_freedom=degrees,
-        started_from_fit=started,
-    )
+    return Part({name: x[:count] for name, x in values.items()}, covariance[:count], status[:count])

@@ -17,7 +17,16 @@ from ..records import PERIODS, RANGES, Parameters
 from ..statistics import Statistics
 from .newton import value_gradient_hessian
 
-__all__ = ["Local", "derivatives", "describe", "equivalent", "invert", "log_density", "log_prior_ratio"]
+__all__ = [
+    "Local",
+    "derivatives",
+    "describe",
+    "distinct_copies",
+    "equivalent",
+    "invert",
+    "log_density",
+    "log_prior_ratio",
+]
 
 
 class Local(NamedTuple):
@@ -41,7 +50,7 @@ def uniform_std(name: str) -> float:
     return (high - low) / sqrt(12)
 
 
-def _rows(model: Model) -> np.ndarray:
+def distinct_copies(model: Model) -> np.ndarray:
     """Which of the eight copies a model with fixed parameters can tell apart, ``(8,)`` bool."""
     generic = dict(zip(Parameters._fields, (0.37, 0.41, 1.13, 0.29, 0.53), strict=True))
     generic |= dict.fromkeys(model.dropped, 0.0) | model.fixed
@@ -62,7 +71,7 @@ def _rows(model: Model) -> np.ndarray:
 def equivalent(model: Model, parameters: Parameters) -> Parameters:
     """The copies of ``parameters`` (pixels,) that the model can tell apart, ``(copies, pixels)``."""
     known = Parameters(*(np.where(np.isnan(x), np.zeros_like(x), x) for x in parameters))
-    rows = _rows(model)
+    rows = distinct_copies(model)
     return Parameters(*(x[rows] for x in orbit(known)))
 
 

@@ -17,7 +17,9 @@ from ..noise import InferredNoise
 from ..records import Parameters
 from ..statistics import Statistics
 
-__all__ = ["Judged", "judge", "tail_probability"]
+__all__ = ["BAD_FIT_PROBABILITY", "Judged", "judge", "tail_probability"]
+
+BAD_FIT_PROBABILITY = 1e-3
 
 
 class Judged(NamedTuple):

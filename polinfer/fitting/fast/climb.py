@@ -1,0 +1,216 @@
+"""Newton steps on the log posterior of a block of pixels at once, element by element."""
+
+from __future__ import annotations
+
+from functools import partial
+from math import pi
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..newton import tolerance
+from .data import Data
+from .likelihoods import Residual, Slopes
+from .linear import factorise, solve
+from .overlap import coefficients, energy, overlap, overlap_slopes, turned
+from .point import Point, matrix, polariser_vectors, retarder_vectors, rotate, unit
+from .priors import COPIES, Term, log_prior
+from .scene import Scene
+
+__all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "precise_enough"]
+
+LONGEST_STEP = 0.7  # radians of any angle y
+LEAST_CURVATURE = 1e-6  # of a direction of which neither data nor prior say anything
+ROOT_HALF = 0.5**0.5
+
+
+class Posterior(NamedTuple):
+    """Log posterior at a point with its derivatives by the free angles, and what the residual is there."""
+
+    gradient: dict[int, Any]
+    hessian: dict[tuple[int, int], Any]
+    residual: Residual
+
+
+def evaluate(scene: Scene, data: Data, point: Point) -> tuple[Any, Residual]:
+    """Log posterior, all constants included, from the residual itself."""
+    u, _ = polariser_vectors(point)
+    q, _ = retarder_vectors(point)
+    seen = matrix(scene.retarder_first, u, q)
+    model = [
+        [tuple(_product(seen[i], [data.illumination[k][j] for k in (0, 1)], part) for part in (0, 1)) for j in (0, 1)]
+        for i in (0, 1)
+    ]
+    at = scene.likelihood.residual(model, data.response)  # type: ignore[arg-type]
+    value = scene.likelihood.value(at, data.residual, data.count) + data.constant
+    return value + (log_prior(scene.prior, point) + scene.constant), at
+
+
+def _product(row: list[Any], column: list[Any], part: int) -> Any:
+    if part == 0:
+        return sum(a[0] * b[0] - a[1] * b[1] for a, b in zip(row, column, strict=True))
+    return sum(a[0] * b[1] + a[1] * b[0] for a, b in zip(row, column, strict=True))
+
+
+def derivatives(scene: Scene, balanced: bool, data: Data, point: Point, at: Residual) -> Posterior:
+    """Gradient and Hessian of the log likelihood by the free angles (without the prior)."""
+    slopes: Slopes = scene.likelihood.slopes(at, data.residual, data.count)
+    k = data.product
+    if scene.likelihood.free_phase:
+        k = turned(k, unit(*at.gain))
+    first = overlap(coefficients(scene.retarder_first, k), point, data.one)
+    free = scene.free
+    gradient = {i: slopes.r * first.gradient[i] for i in free}
+    hessian = {(i, j): slopes.r * first.hessian[i, j] for i in free for j in free if i <= j}
+    outer: list[tuple[Any, list[Any], list[Any]]] = []
+    if slopes.rr is not None:
+        outer.append((slopes.rr, first.gradient, first.gradient))
+    if slopes.across is not None:
+        across = type(k)(*((im, -re) for re, im in k))
+        _, slant = overlap_slopes(coefficients(scene.retarder_first, across), point)
+        outer.append((slopes.across, slant, slant))
+    if not balanced:
+        second = energy(scene.retarder_first, data.power, point)
+        gradient = {i: g + slopes.m * second.gradient[i] for i, g in gradient.items()}
+        hessian = {key: h + slopes.m * second.hessian[key] for key, h in hessian.items()}
+        if slopes.mm is not None:
+            outer.append((slopes.mm, second.gradient, second.gradient))
+        if slopes.rm is not None:
+            outer += [(slopes.rm, first.gradient, second.gradient), (slopes.rm, second.gradient, first.gradient)]
+    for weight, left, right in outer:
+        hessian = {(i, j): h + weight * left[i] * right[j] for (i, j), h in hessian.items()}
+    return Posterior(gradient, hessian, at)
+
+
+def with_prior(prior: tuple[Term | None, ...], point: Point, likelihood: Posterior) -> Posterior:
+    """The derivatives of the log posterior."""
+    gradient, hessian = dict(likelihood.gradient), dict(likelihood.hessian)
+    for i, term in enumerate(prior):
+        found = None if term is None else term.evaluate(point[i])
+        if found is not None:
+            gradient[i] = gradient[i] + found[1]
+            hessian[i, i] = hessian[i, i] + found[2]
+    return Posterior(gradient, hessian, likelihood.residual)
+
+
+def kept(one: Any, posterior: Posterior) -> Posterior:
+    """The same, behind a division by 1: XLA would compute each entry anew for each of its uses."""
+    gradient, hessian = jax.tree.map(lambda x: x / one, (posterior.gradient, posterior.hessian))
+    return Posterior(gradient, hessian, posterior.residual)
+
+
+def frozen(scene: Scene, point: Point, gradient: dict[int, Any]) -> dict[int, Any]:
+    """Where a bounded angle lies on its bound and would leave it uphill."""
+    found = {}
+    if 0 in scene.free:
+        c, s = point.diattenuation
+        found[0] = (jnp.abs(s) >= c * (1 - 4 * jnp.finfo(c.dtype).eps)) & (gradient[0] * s >= 0)
+    if 2 in scene.free and scene.bounded:
+        c, s = point.retardance
+        found[2] = (c <= 0) & (gradient[2] * s >= 0)
+    return found
+
+
+def held(posterior: Posterior, stuck: dict[int, Any]) -> Posterior:
+    """The problem in which the angles ``stuck`` do not move."""
+    gradient = {i: jnp.where(stuck[i], 0, g) if i in stuck else g for i, g in posterior.gradient.items()}
+    hessian = dict(posterior.hessian)
+    for i, where in stuck.items():
+        for key in hessian:
+            if i in key:
+                hessian[key] = jnp.where(where, -1.0 if key == (i, i) else 0.0, hessian[key])
+    return Posterior(gradient, hessian, posterior.residual)
+
+
+def precise_enough(data: Data) -> Any:
+    """Largest accepted squared Newton decrement; the gradient is rounded like eps times the square of the SNR."""
+    dtype = np.dtype(data.strength.dtype)
+    return tolerance(dtype) + 20 * (jnp.finfo(dtype).eps * data.strength) ** 2
+
+
+def _project(scene: Scene, point: Point) -> Point:
+    """Back onto the ranges of bounded angles."""
+    if 0 in scene.free:
+        c, s = point.diattenuation
+        out = jnp.abs(s) > c
+        point = point._replace(diattenuation=(jnp.where(out, ROOT_HALF, c), jnp.where(out, jnp.sign(s) * ROOT_HALF, s)))
+    if 2 in scene.free and scene.bounded:
+        c, s = point.retardance
+        out = c < 0
+        point = point._replace(retardance=(jnp.where(out, 0.0, c), jnp.where(out, jnp.sign(s), s)))
+    return point
+
+
+def moved(copy: tuple[tuple[int, float], ...], point: Point) -> Point:
+    """One of the eight equivalent points."""
+    pairs = []
+    for (c, s), (sign, shift) in zip(point, copy, strict=True):
+        turn = -1.0 if abs(shift - pi) < 1e-9 else 1.0
+        pairs.append((turn * c, turn * sign * s))
+    return Point(*pairs)
+
+
+def better_copy(scene: Scene, point: Point) -> Point:
+    """The equivalent point with the highest prior; it describes the same matrix."""
+    if len(scene.groups) == 1:
+        return point
+    seen: list[tuple[Term | None, ...]] = []
+    best, top = point, log_prior(scene.prior, point)
+    for row, copy in zip(scene.copies, COPIES, strict=True):
+        prior = tuple(None if t is None else t.transformed(*m) for t, m in zip(scene.prior, copy, strict=True))
+        if not row or prior == scene.prior or prior in seen:
+            continue
+        seen.append(prior)
+        value = log_prior(prior, point)
+        better = value > top
+        other = moved(copy, point)
+        best = jax.tree.map(partial(jnp.where, better), other, best)
+        top = jnp.where(better, value, top)
+    return best
+
+
+def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any) -> Point:
+    """At most ``iterations`` damped Newton steps uphill, none of which lowers the density."""
+    eps = jnp.finfo(data.strength.dtype).eps
+    enough = precise_enough(data)
+    rounding = 20 * eps * (1 + data.strength)
+    free = scene.free
+
+    def advance(carry: Any) -> Any:
+        count, point, value, damping, done = carry
+        _, at = evaluate(scene, data, point)
+        slope = with_prior(scene.prior, point, derivatives(scene, balanced, data, point, at))
+        slope = held(slope, frozen(scene, point, slope.gradient))
+        slope = kept(data.one, slope)
+        a = {
+            (m, n): -slope.hessian[i, j]
+            + (damping * (jnp.abs(slope.hessian[i, i]) + LEAST_CURVATURE) if i == j else 0.0)
+            for m, i in enumerate(free)
+            for n, j in enumerate(free)
+            if m <= n
+        }
+        lower, smallest = factorise(a, len(free), LEAST_CURVATURE)
+        step, decrement = solve(lower, [slope.gradient[i] for i in free])
+        decrement = decrement / data.one
+        done = done | ((decrement < enough) & (smallest > 0) & (damping == 0))
+        pairs = list(point)
+        for i, x in zip(free, step, strict=True):
+            pairs[i] = rotate(point[i], jnp.clip(x, -LONGEST_STEP, LONGEST_STEP))
+        trial = better_copy(scene, _project(scene, Point(*pairs)))
+        new = evaluate(scene, data, trial)[0] / data.one
+        accept = (new >= value - rounding) & ~done
+        damping = jnp.where(accept, 0.1 * damping, jnp.maximum(10 * damping, 1e-2))
+        damping = jnp.where(damping < 1e-3, 0.0, damping)
+        point = jax.tree.map(partial(jnp.where, accept), trial, point)
+        return count + 1, point, jnp.where(accept, new, value), damping, done | ~jnp.isfinite(value)
+
+    def unfinished(carry: Any) -> Any:
+        return (carry[0] < iterations) & ~jnp.all(carry[4])
+
+    point = better_copy(scene, point)
+    value, _ = evaluate(scene, data, point)
+    zero = jnp.zeros_like(value)
+    carry = (jnp.zeros((), jnp.int32), point, value, zero, jnp.zeros(value.shape, bool))
+    return jax.lax.while_loop(unfinished, advance, carry)[1]

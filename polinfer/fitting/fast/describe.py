@@ -1,0 +1,221 @@
+"""At the maximum: parameters, covariance, evidence, and what there is to be said about the pixel."""
+
+from __future__ import annotations
+
+from math import log, pi
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ...records import PERIODS, Parameters
+from ..local_gaussian import uniform_std
+from .climb import derivatives, evaluate, frozen, held, kept, precise_enough, with_prior
+from .data import Data
+from .linear import Triangle, factorise, inverse, solve
+from .point import Point
+from .priors import COPIES, FACTORS, log_prior
+from .scene import Scene
+
+__all__ = ["CONVERGED", "DOUBTFUL", "FROZEN", "NON_FINITE", "ROWS", "WIDE", "describe", "rows"]
+
+# bits of the flags
+CONVERGED, DOUBTFUL, NON_FINITE, WIDE = 1, 2, 4, 32
+FROZEN = {0: 8, 2: 16}  # the maximum lies on a bound of the diattenuation, of the retardance
+MANY = 0.02  # variance of the angles of J (rad^2) beyond which the closed form may start in the wrong valley
+
+# rows of the result, each an array of pixels
+ROWS = {"parameters": slice(0, 5), "std": slice(5, 10), "covariance": slice(10, 35)}
+ROWS |= {"log_posterior": 35, "log_evidence": 36, "chi_square": 37, "slope_0": 38, "slope_2": 39}
+ROWS |= {"gain_real": 40, "gain_imaginary": 41}
+
+
+def rows(scene: Scene) -> int:
+    """Number of rows of the result."""
+    return 42 if scene.likelihood.free_phase else 40
+
+
+def _wrap(x: Any, period: float) -> Any:
+    return x - period * jnp.ceil(x / period - 0.5)
+
+
+def _lexicographic(left: list[Any], right: list[Any], slack: float) -> Any:
+    """Whether ``left`` comes before ``right``: larger in the first entry in which they differ."""
+    found: Any = False
+    for a, b in zip(reversed(left), reversed(right), strict=True):
+        found = jnp.where(jnp.abs(a - b) <= slack, found, a > b)
+    return found
+
+
+def _choose(scene: Scene, point: Point, values: Parameters) -> tuple[Parameters, dict[int, Any]]:
+    """Of the copies with the highest prior the canonical one, and the sign of every angle in it.
+
+    Distance and prior are sums over the two elements, so each chooses for itself.
+    """
+    eps = float(jnp.finfo(values.diattenuation.dtype).eps)
+    slack, room = 64 * eps, 1e-6 if eps < 1e-10 else 1e-3
+    reference = Parameters(1.0, pi / 4, pi, pi / 4, 0.0)
+    weights = Parameters(1.0, 2.0, 1.0, 2.0, 1.0)
+    out: dict[str, Any] = {}
+    signs: dict[int, Any] = {}
+    for indices in ((0, 1), (2, 3, 4)):
+        names = [Parameters._fields[i] for i in indices]
+        best: Any = None
+        seen = []
+        for row, copy in zip(scene.copies, COPIES, strict=True):
+            move = tuple(copy[i] for i in indices)
+            if not row or move in seen:
+                continue
+            seen.append(move)
+            part = tuple(scene.prior[i].transformed(*copy[i]) if i in indices and scene.prior[i] is not None else None
+                         for i in range(5))  # type: ignore[union-attr]  # fmt: skip
+            prior = log_prior(part, point)
+            candidate, far = [], 0.0
+            for name, (sign, shift) in zip(names, move, strict=True):
+                value = sign * getattr(values, name)
+                if name != "diattenuation":
+                    factor, period = getattr(FACTORS, name), getattr(PERIODS, name)
+                    if shift:
+                        value = value + shift / factor
+                        value = jnp.where(value > 0.5 * period, value - period, value)
+                    if sign < 0 and name != "retardance":
+                        value = _wrap(value, period)
+                    weight = getattr(weights, name)
+                    far = far + _wrap(weight * (value - getattr(reference, name)), 2 * pi) ** 2
+                else:
+                    far = far + (value - reference.diattenuation) ** 2
+                candidate.append(value)
+            sign_of = [jnp.full_like(point.diattenuation[0], float(sign)) for sign, _ in move]
+            if best is None:
+                best = (prior, far, candidate, sign_of)
+                continue
+            tied = jnp.abs(far - best[1]) <= slack * (1 + best[1])
+            nearer = jnp.where(tied, _lexicographic(candidate, best[2], 4 * eps), far < best[1])
+            better = jnp.where(jnp.abs(prior - best[0]) <= room, nearer, prior > best[0])
+            best = tuple(
+                [jnp.where(better, a, b) for a, b in zip(new, old, strict=True)]
+                if isinstance(new, list)
+                else jnp.where(better, new, old)
+                for new, old in zip((prior, far, candidate, sign_of), best, strict=True)
+            )
+        for i, name, value, sign in zip(indices, names, best[2], best[3], strict=True):
+            out[name], signs[i] = value, sign
+    return Parameters(**out), signs
+
+
+def _values(scene: Scene, point: Point) -> Parameters:
+    found = [2 * point.diattenuation[0] * point.diattenuation[1]]
+    for name, (c, s) in zip(Parameters._fields[1:], point[1:], strict=True):
+        found.append(jnp.arctan2(s, c) / getattr(FACTORS, name))
+    return Parameters(*(x if v is None else jnp.full_like(x, v) for x, v in zip(found, scene.values, strict=True)))
+
+
+def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[Any, Any]:
+    """The rows of the result and the flags of every pixel at a point.
+
+    The covariance is that of the parameters. Where the maximum lies on a bound (``FROZEN``) the rows of that parameter
+    hold instead how the others follow the bounded angle y, and the inverse curvature along y; then the evidence leaves
+    that angle out.
+    """
+    if not scene.bounded:  # the other sign of J, which a free phase takes up
+        c, s = point.retardance
+        down = c < 0
+        point = point._replace(retardance=(jnp.where(down, -c, c), jnp.where(down, -s, s)))
+    value, at = evaluate(scene, data, point)
+    likelihood = kept(data.one, derivatives(scene, balanced, data, point, at))
+    whole = with_prior(scene.prior, point, likelihood)
+    stuck = frozen(scene, point, whole.gradient)
+    local = held(whole, stuck)
+    free, n = scene.free, len(scene.free)
+    at_index = {i: m for m, i in enumerate(free)}
+    a = {(m, k): -local.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
+    lower, smallest = factorise(a, n)
+    _, decrement = solve(lower, [local.gradient[i] for i in free])
+    c = {key: x / data.one for key, x in inverse(lower, n).items()}
+    c |= {(k, m): x for (m, k), x in c.items()}
+    flags = jnp.where((decrement < precise_enough(data)) & (smallest > 0), CONVERGED, 0)
+    finite = jnp.isfinite(value)
+    # angles of J itself do not depend on how well axes are defined
+    sine = [jnp.ones_like(value), point.diattenuation[1], jnp.ones_like(value), point.retardance[1],
+            point.retardance[1] * point.retardance_angle[1]]  # fmt: skip
+    wide = ~(smallest > 0)
+    for i in free:
+        wide = wide | (c[at_index[i], at_index[i]] * sine[i] ** 2 > MANY)
+
+    # evidence: this point's own prior, then those of the copies
+    cosine = point.diattenuation[0] ** 2 - point.diattenuation[1] ** 2  # cos delta
+    log_volume = _log_volume(free, lower, stuck, cosine)
+    total, doubtful = jnp.full_like(value, log(scene.groups[0][1])), jnp.zeros(value.shape, bool)
+    own = log_prior(scene.prior, point)
+    for prior, count in scene.groups[1:]:
+        other = held(with_prior(prior, point, likelihood), stuck)
+        b = dict(a)
+        change = []
+        for i in free:
+            delta = jnp.zeros_like(value) if prior[i] == scene.prior[i] else other.gradient[i] - local.gradient[i]
+            change.append(delta)
+            b[at_index[i], at_index[i]] = -other.hessian[i, i]
+        low, least = factorise(b, n)
+        lift = 0.5 * solve(low, change)[1]
+        gap = log_prior(prior, point) - own
+        # one that could climb above this one is to be tried
+        doubtful = doubtful | (least <= 0) | (gap + 2 * lift + 1e-3 > 0)
+        volume = _log_volume(free, low, stuck, cosine)
+        term = gap + jnp.where(least > 0, jnp.clip(lift, 0, -gap), 0) + volume - log_volume + log(count)
+        total = jnp.logaddexp(total, jnp.where(jnp.isfinite(term), term, -jnp.inf))
+    evidence = value + log_volume + total
+
+    flags = flags | jnp.where(doubtful, DOUBTFUL, 0) | jnp.where(wide, WIDE, 0) | jnp.where(finite, 0, NON_FINITE)
+    for i, where in stuck.items():
+        flags = flags | jnp.where(where, FROZEN[i], 0)
+
+    # the bounded angles that are held: how the others follow them
+    for i, where in stuck.items():
+        m = at_index[i]
+        others = [k for k in range(n) if k != m]
+        slope = {k: held(whole, {j: w for j, w in stuck.items() if j != i}).hessian[_key(i, free[k])] for k in others}
+        follow = {k: sum(c[k, o] * slope[o] for o in others) for k in others}
+        curvature = -whole.hessian[i, i] - sum(slope[k] * follow[k] for k in others)
+        for k in others:
+            c[m, k] = c[k, m] = jnp.where(where, follow[k], c[k, m])
+        c[m, m] = jnp.where(where, 1 / curvature, c[m, m])
+
+    parameters, signs = _choose(scene, point, _values(scene, point))
+    parameters, signs = jax.tree.map(lambda x: x / data.one, (parameters, signs))
+    widths = [2 * cosine, 0.5, 2.0, 0.5, 1.0]
+    if 0 in stuck:
+        widths[0] = jnp.where(stuck[0], 1.0, widths[0])
+    if 2 in stuck:
+        widths[2] = jnp.where(stuck[2], 1.0, widths[2])
+    zero = jnp.zeros_like(value)
+    covariance = []
+    for i in range(5):
+        for j in range(5):
+            if i in at_index and j in at_index:
+                scale = widths[i] * widths[j]
+                covariance.append(signs[i] * signs[j] * scale * c[at_index[i], at_index[j]])
+            else:
+                covariance.append(zero)
+    std = [jnp.sqrt(covariance[6 * i]) for i in range(5)]
+    slopes = [jnp.where(stuck[i], jnp.abs(whole.gradient[i]), 0) if i in stuck else zero for i in (0, 2)]
+    found = [*parameters, *std, *covariance, value, evidence, 2 * (at.square + data.residual), *slopes]
+    gain = scene.likelihood.mean_gain(at)
+    if gain is not None:
+        found += list(gain)
+    return jnp.stack([jnp.broadcast_to(x, value.shape) for x in found]), flags
+
+
+def _key(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i <= j else (j, i)
+
+
+def _log_volume(free: tuple[int, ...], lower: Triangle, stuck: dict[int, Any], cosine: Any) -> Any:
+    """Log of the Gaussian's volume in the parameters; no direction holds more than its range."""
+    jacobian = [2 * cosine, 0.5, 2.0, 0.5, 1.0]
+    total: Any = 1.0
+    for m, i in enumerate(free):
+        scale = (2 * pi) ** 0.5 * jacobian[i]
+        most = 12**0.5 * uniform_std(Parameters._fields[i])
+        part = jnp.minimum(scale / lower[m, m], most)
+        total = total * (jnp.where(stuck[i], 1, part) if i in stuck else part)
+    return jnp.log(total)

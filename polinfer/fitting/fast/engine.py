@@ -1,0 +1,199 @@
+"""A frame through the compiled code: blocks of pixels on all cores, and another look at the difficult ones."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...records import Parameters
+from ...statistics import Statistics
+from . import kernel
+from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROWS, WIDE, rows
+from .priors import FACTORS
+from .scene import Scene
+
+__all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
+
+BLOCKS = (1024, 4096)  # numbers of pixels for which code is compiled
+FIRST, MOST = 3, 60  # Newton steps of the first pass, and of the others
+
+
+@dataclass(frozen=True)
+class Responses:
+    """Pixels that share the illumination: responses ``(pixels, 2, n)``, sigma ``(pixels)`` or ``(1)``."""
+
+    response: np.ndarray
+    sigma: np.ndarray
+    shared: kernel.Shared
+    balanced: bool
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return len(self.response)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Real type of the results."""
+        return np.zeros((), jax.dtypes.canonicalize_dtype(self.response.dtype)).real.dtype
+
+    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: bool, iterations: int) -> tuple[Any, Any]:
+        """Rows and flags of the pixels ``take``."""
+        sigma = self.sigma if len(self.sigma) == 1 else self.sigma[take]
+        return kernel.from_responses(
+            scene, self.balanced, self.response[take], sigma, self.shared, start, given, iterations, self.dtype.type(1)
+        )
+
+
+@dataclass(frozen=True)
+class Summed:
+    """Pixels with statistics of their own, ``(pixels, ...)``."""
+
+    statistics: Statistics
+    balanced: bool
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return len(self.statistics.residual)
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Real type of the results."""
+        return np.zeros((), jax.dtypes.canonicalize_dtype(self.statistics.response.dtype)).real.dtype
+
+    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: bool, iterations: int) -> tuple[Any, Any]:
+        """Rows and flags of the pixels ``take``."""
+        part = Statistics(*(x[take] for x in self.statistics))
+        return kernel.from_statistics(scene, self.balanced, part, start, given, iterations, self.dtype.type(1))
+
+
+Frame = Responses | Summed
+
+
+def pairs_of(parameters: Parameters, dtype: np.dtype) -> np.ndarray:
+    """(cosine, sine) of the five angles ``(10, pixels)``."""
+    found = []
+    for name, value, factor in zip(Parameters._fields, parameters, FACTORS, strict=True):
+        x = np.asarray(value, float)
+        angle = 0.5 * np.arcsin(np.clip(x, -1, 1)) if name == "diattenuation" else factor * x
+        found += [np.cos(angle), np.sin(angle)]
+    return np.stack(found).astype(dtype)
+
+
+def _fill(index: np.ndarray, size: int) -> np.ndarray:
+    """As many indices as code is compiled for."""
+    return np.concatenate([index, np.full(size - len(index), index[0])])
+
+
+def _each(work: Callable[[int], None], items: Iterable[int]) -> None:
+    items = list(items)
+    cores = os.cpu_count() or 1
+    if len(items) == 1 or cores == 1:
+        for item in items:
+            work(item)
+        return
+    with ThreadPoolExecutor(min(cores, 4)) as pool:
+        list(pool.map(work, items))
+
+
+def _pass(
+    scene: Scene, frame: Frame, index: np.ndarray | None, start: np.ndarray | None, iterations: int,
+    out: np.ndarray, flags: np.ndarray, done: Callable[[int], Any],
+) -> None:  # fmt: skip
+    """Rows and flags of the pixels ``index`` (None: all), from a start or the closed form, into ``out``."""
+    count = frame.pixels if index is None else len(index)
+    size = BLOCKS[0] if frame.pixels <= BLOCKS[0] or count <= BLOCKS[0] // 2 else BLOCKS[1]
+    nothing = kernel.no_start(size, frame.dtype)
+
+    def work(begin: int) -> None:
+        end = min(begin + size, count)
+        take: slice | np.ndarray
+        if index is None and end - begin == size:
+            take = slice(begin, end)
+        else:
+            own = np.arange(begin, end) if index is None else index[begin:end]
+            take = _fill(own, size)
+        begun = nothing
+        if start is not None:
+            begun = jnp.asarray(start[:, _fill(np.arange(begin, end), size)])
+        found, bits = frame.run(scene, take, begun, start is not None, iterations)
+        out[:, begin:end] = np.asarray(found)[:, : end - begin]
+        flags[begin:end] = np.asarray(bits)[: end - begin]
+        done(end - begin)
+
+    _each(work, range(0, count, size))
+
+
+def _alternatives(points: np.ndarray) -> list[np.ndarray]:
+    """Starts where the data are ambiguous, from the points ``(10, pixels)`` found so far.
+
+    First the other side of circularity +-pi/2, where an equivalent set has the better prior.
+    """
+
+    def changed(**pairs: tuple[Any, Any]) -> np.ndarray:
+        new = points.copy()
+        for name, (c, s) in pairs.items():
+            i = Parameters._fields.index(name)
+            length = np.hypot(c, s)  # a vector that is not a unit vector would be taken for a better fit
+            new[2 * i], new[2 * i + 1] = c / length, s / length
+        return new
+
+    x1, y1, _, s2, x3, y3, a, b = points[2:10]
+    edge = np.where(s2 < 0, -1.0, 1.0)
+    return [
+        changed(circularity=(-a, b)),
+        changed(circularity=(0.999, 0.045)),
+        changed(circularity=(0.999, 0.045), retardance_angle=(x3, -y3)),
+        changed(diattenuation=(0.9997, 0.025)),
+        changed(diattenuation_angle=(-x1, -y1)),
+        changed(retardance=(0.05, edge)),
+        changed(retardance=(0.05, -edge)),
+        changed(diattenuation=(0.85, 0.527)),
+    ]
+
+
+def solve_frame(
+    scene: Scene, frame: Frame, earlier: Parameters | None, done: Callable[[int], Any]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rows of the result ``(rows, pixels)`` and the flags of every pixel, the best maximum found."""
+    pixels = frame.pixels
+    out, flags = np.empty((rows(scene), pixels), frame.dtype), np.empty(pixels, np.int32)
+    _pass(scene, frame, None, None, FIRST, out, flags, done)
+    again = partial(_again, scene, frame, out, flags)
+    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points])
+    again((flags & (DOUBTFUL | WIDE | NON_FINITE)) == DOUBTFUL, lambda points, _: _alternatives(points)[:1])
+    again((flags & (WIDE | NON_FINITE)) == WIDE, lambda points, _: _alternatives(points))
+    if earlier is not None:
+        told = pairs_of(earlier, frame.dtype)
+        finite = np.isfinite(told).all(axis=0)
+        again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
+    return out, flags
+
+
+def _again(
+    scene: Scene, frame: Frame, out: np.ndarray, flags: np.ndarray, which: np.ndarray,
+    starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]],
+) -> None:  # fmt: skip
+    """Climb again from other starts, and keep what is better."""
+    index = np.flatnonzero(which)
+    if len(index) == 0:
+        return
+    new, bits = np.empty((len(out), len(index)), out.dtype), np.empty(len(index), np.int32)
+    points = pairs_of(Parameters(*out[ROWS["parameters"]][:, index]), frame.dtype)
+    for begun in starts(points, index):
+        _pass(scene, frame, index, begun, MOST, new, bits, lambda _: None)
+        value, old = new[ROWS["log_posterior"]], out[ROWS["log_posterior"], index]
+        # what is better by rounding only is worth no change, unless it settles a pixel
+        slack, rounding = (1e-9, 1e-6) if out.dtype == np.float64 else (1e-4, 0.05)
+        settled = (bits & CONVERGED) > (flags[index] & CONVERGED)
+        better = (bits & NON_FINITE == 0) & ((value > old + slack) | ((value > old - rounding) & settled))
+        out[:, index[better]], flags[index[better]] = new[:, better], bits[better]

@@ -1,0 +1,117 @@
+"""The compiled code: from data to the rows of the result, a block of pixels at a time."""
+
+from __future__ import annotations
+
+from functools import partial
+from math import pi
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ...statistics import Statistics
+from .climb import climb
+from .data import Data, Matrix, prepare
+from .describe import describe
+from .point import Point
+from .scene import Scene
+from .start import closed_form
+
+__all__ = ["Shared", "from_responses", "from_statistics", "no_start"]
+
+
+class Shared(NamedTuple):
+    """What all pixels of a frame share: ``U sqrt(w) = R Q`` with weights w, and the sum of ``log w`` of the data."""
+
+    root: Any
+    rows: Any
+    root_weight: Any
+    log_weight: Any
+    count: Any
+
+
+def no_start(pixels: int, dtype: Any) -> jax.Array:
+    """Stands for a start where there is none."""
+    return jnp.zeros((10, pixels), dtype)
+
+
+def _parts(a: Any) -> Matrix:
+    return [[(jnp.real(a[..., i, j]), jnp.imag(a[..., i, j])) for j in (0, 1)] for i in (0, 1)]
+
+
+def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, iterations: Any) -> tuple[Any, Any]:
+    closed = closed_form(scene, data)
+    told = Point(*((start[2 * i], start[2 * i + 1]) for i in range(5)))
+    point = jax.tree.map(partial(jnp.where, given), told, closed)
+    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def from_statistics(
+    scene: Scene, balanced: bool, statistics: Statistics, start: Any, given: Any, iterations: Any, one: Any
+) -> tuple[Any, Any]:
+    """Rows ``(rows, pixels)`` and flags of pixels with statistics of their own.
+
+    ``start`` (10, pixels) are (cosine, sine) of the five angles, used if ``given``; else the closed form is.
+    """
+    data = prepare(
+        balanced,
+        _parts(statistics.illumination),
+        _parts(statistics.response),
+        statistics.residual,
+        statistics.constant,
+        statistics.count,
+        one,
+    )
+    return _finish(scene, balanced, data, start, given, iterations)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def from_responses(
+    scene: Scene,
+    balanced: bool,
+    response: Any,
+    sigma: Any,
+    shared: Shared,
+    start: Any,
+    given: Any,
+    iterations: Any,
+    one: Any,
+) -> tuple[Any, Any]:
+    """The same from the responses ``(pixels, 2, n)`` themselves, where all pixels share the illumination.
+
+    ``Y = V Q^H`` and ``E = |V - Y Q|^2`` are formed on the way, the residual directly.
+    """
+    inverse = 1 / sigma
+    states = response.shape[-1]
+    real, imaginary = jnp.real(shared.rows), jnp.imag(shared.rows)
+    v = []
+    for i in (0, 1):
+        row = []
+        for k in range(states):
+            weight = shared.root_weight[k]
+            scale = jnp.where(weight > 0, weight, 0) * inverse
+            row.append(
+                tuple(jnp.where(weight > 0, part(response[:, i, k]) * scale, 0) for part in (jnp.real, jnp.imag))
+            )
+        v.append(row)
+    y = [
+        [
+            (
+                sum(v[i][k][0] * real[j, k] + v[i][k][1] * imaginary[j, k] for k in range(states)),
+                sum(v[i][k][1] * real[j, k] - v[i][k][0] * imaginary[j, k] for k in range(states)),
+            )
+            for j in (0, 1)
+        ]
+        for i in (0, 1)
+    ]
+    residual: Any = 0.0
+    for i in (0, 1):
+        for k in range(states):
+            re = v[i][k][0] - sum(y[i][j][0] * real[j, k] - y[i][j][1] * imaginary[j, k] for j in (0, 1))
+            im = v[i][k][1] - sum(y[i][j][0] * imaginary[j, k] + y[i][j][1] * real[j, k] for j in (0, 1))
+            residual = residual + re * re + im * im
+    constant = shared.log_weight - shared.count * jnp.log(pi * sigma * sigma) - residual
+    root = [[(re * inverse, im * inverse) for re, im in row] for row in _parts(shared.root)]
+    data = prepare(balanced, root, y, residual, constant, shared.count, one)
+    return _finish(scene, balanced, data, start, given, iterations)

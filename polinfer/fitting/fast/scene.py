@@ -1,0 +1,79 @@
+"""What the fast route must know of a model, decided once, outside compiled code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import asin, cos, pi, sin
+
+from ...model import Model
+from ...orderings import PolariserFirst, RetarderFirst
+from ...records import Parameters
+from ..local_gaussian import distinct_copies
+from .likelihoods import Likelihood, likelihood
+from .priors import FACTORS, Term, copies, terms
+
+__all__ = ["Scene", "scene"]
+
+BOUNDS = {"diattenuation": (-1.0, 1.0), "retardance": (-pi, pi)}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A model in the form in which the fast route evaluates it.
+
+    ``free`` are the angles that move; ``fixed`` the (cosine, sine) of the others; ``values`` the fixed values to
+    report (0 for parameters that drop out). ``copies`` are which of the eight equivalent sets the model tells apart,
+    ``groups`` their distinct priors as functions of the point, with the number of copies that share each; the first
+    is that of the point itself. ``bounded`` says that the retardance ends at -pi and pi.
+    """
+
+    model: Model
+    retarder_first: bool
+    likelihood: Likelihood
+    prior: tuple[Term | None, ...]
+    constant: float
+    free: tuple[int, ...]
+    fixed: tuple[tuple[float, float] | None, ...]
+    values: tuple[float | None, ...]
+    copies: tuple[bool, ...]
+    groups: tuple[tuple[tuple[Term | None, ...], int], ...]
+    bounded: bool
+
+
+@lru_cache(maxsize=256)
+def scene(model: Model) -> Scene | None:
+    """The scene of a model, or None if a part of it has no fast form: then the general route takes it."""
+    kind, prior = likelihood(model), terms(model)
+    shipped = type(model.ordering) in (RetarderFirst, PolariserFirst)
+    bounds = all(BOUNDS.get(name) == pair for name, pair in model.bounds.items())
+    if kind is None or prior is None or not shipped or not bounds or not model.free:
+        return None
+    rows = distinct_copies(model)
+    counts: dict[tuple[Term | None, ...], int] = {prior: 0}
+    for one in copies(prior, rows):
+        counts[one] = counts.get(one, 0) + 1
+    fixed: list[tuple[float, float] | None] = []
+    values: list[float | None] = []
+    for name, factor in zip(Parameters._fields, FACTORS, strict=True):
+        if name in model.free:
+            fixed.append(None)
+            values.append(None)
+            continue
+        value = model.fixed.get(name, 0.0)
+        angle = 0.5 * asin(value) if name == "diattenuation" else factor * value
+        fixed.append((cos(angle), sin(angle)))
+        values.append(value)
+    return Scene(
+        model=model,
+        retarder_first=type(model.ordering) is RetarderFirst,
+        likelihood=kind,
+        prior=prior,
+        constant=sum(t.constant for t in prior if t is not None),
+        free=tuple(i for i, name in enumerate(Parameters._fields) if name in model.free),
+        fixed=tuple(fixed),
+        values=tuple(values),
+        copies=tuple(bool(row) for row in rows),
+        groups=tuple(counts.items()),
+        bounded="retardance" in model.bounds,
+    )
