@@ -213,6 +213,15 @@ def test_what_the_model_leaves_out_counts_as_noise_of_the_frame():
     assert float(fit(Model(noise=InferredNoise(1.0, 1e-10, "frame")), clean).sigma[0, 0]) < 1e-5
 
 
+def test_an_empty_field_and_a_perfect_polariser_do_not_falsify_the_sigma_of_a_frame():
+    # at D = 0 and eta = 0 no angle is identified, and yet the fit follows the noise in five directions
+    for x in ((0.0, 0.0, 0.0, 0.0, 0.0), (1.0, 0.3, 1.0, 0.5, 0.2)):
+        truth = Parameters(*(np.full((14, 14), value) for value in x))
+        measurement = replace(simulate(Model(), truth, BALANCED, 0.02, rng=2), sigma=None)
+        found = fit(Model(noise=InferredNoise(1e-3, 1e-9, "frame")), measurement).sigma
+        assert float(found[0, 0]) == pytest.approx(0.02, rel=4 * 0.5 * np.sqrt(2 / (7 * 196)))
+
+
 def test_the_frame_of_a_fit_is_the_maximum_of_the_summed_evidence():
     scene = polinfer.phantoms.lesion((8, 8), rng=3)
     noise = InferredNoise(3.0, 3 * 0.2**2, "frame")
