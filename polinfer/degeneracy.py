@@ -22,7 +22,8 @@ def _wrap(x: np.ndarray, period: float) -> np.ndarray:
 
 def _angle(x: np.ndarray, period: float) -> np.ndarray:
     """``x`` in (-period/2, period/2]; within rounding of the end that is left out it is at the other one."""
-    wrapped, end = _wrap(x, period), np.asarray(0.5 * period, x.dtype)
+    end = np.asarray(0.5 * period, x.dtype)
+    wrapped = np.minimum(_wrap(x, period), end)  # the sum may be rounded to beyond the end
     return np.where(wrapped <= EQUAL * float(np.finfo(x.dtype).eps) - end, end, wrapped)
 
 
@@ -41,8 +42,8 @@ def reduce_ranges(parameters: Parameters) -> Parameters:
     -0.1416
     """
     p = _arrays(parameters)
-    retardance = np.where(np.abs(p.retardance) <= np.asarray(pi, p.retardance.dtype), p.retardance,
-                          _wrap(p.retardance, 2 * pi))  # fmt: skip
+    end = np.asarray(pi, p.retardance.dtype)
+    retardance = np.where(np.abs(p.retardance) <= end, p.retardance, np.minimum(_wrap(p.retardance, 2 * pi), end))
     return Parameters(
         p.diattenuation,
         _angle(p.diattenuation_angle, pi),
@@ -144,8 +145,9 @@ def canonicalise(parameters: Parameters, reference: Parameters = REFERENCE) -> P
     and that one its own. The choice must jump somewhere: it jumps 64 eps beside a tie, where no special value lies.
 
     With the default reference the result has theta_eta in [0, pi/2], xi in [-pi/2, pi/2] and eta of either sign, and
-    ``D >= 0`` if the transmitting axis is in ``[-|D|/pi, pi/2 + |D|/pi]``, else ``D < 0``. A retardance of -pi is not
-    pi (J changes sign) and stays -pi, unless the copy with pi is the one to choose.
+    ``D >= 0`` if the transmitting axis is in ``[-|D|/pi, pi/2 + |D|/pi]``, else ``D < 0``; all this as far as ties are
+    narrow (an axis some 10 eps beyond pi/2 is written as one beyond -pi/2). A retardance of -pi is not pi (J changes
+    sign) and stays -pi, unless the copy with pi is the one to choose.
 
     Parameters
     ----------
