@@ -58,7 +58,8 @@ def _retardance(out: np.ndarray, frozen: np.ndarray) -> None:
     out[ROWS["log_evidence"], index] += np.log(2 * width * np.sqrt(0.5 * np.pi) * tail)
     mills = np.sqrt(2 / np.pi) / tail
     # 1 + z^2 - z mills cancels at large z, where the density is exponential with a small correction
-    moment = np.where(z < 30, 1 + z * z - z * mills, 2 / np.maximum(z, 1) ** 2 * (1 - 6 / np.maximum(z, 1) ** 2))
+    inverse = 1 / np.maximum(z, 1) ** 2
+    moment = np.where(z < 30, 1 + z * z - z * mills, 2 * inverse * (1 - inverse * (5 - 37 * inverse)))
     turn = width**2 * moment
     _write(out, index, 2, covariance, turn, 2 * turn, 4 * turn)
 
