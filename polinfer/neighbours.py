@@ -192,16 +192,15 @@ def pool(summary: Summary, window: Window | None, gain: Gain, noise: Noise) -> P
             for x, t in zip(flat, TRAILING, strict=True)
         )
     )
-    pixels = box_sum(used.reshape(shape).astype(np.int64), window)
-    data = box_sum(np.where(used.reshape(shape), 2 * summary.states, 0), window)
-    rank = box_sum(np.where(used.reshape(shape), summary.rank, 0), window)
+    counts = np.stack([np.ones(shape, np.int64), 2 * summary.states, summary.rank], axis=-1)
+    pixels, data, rank = np.moveaxis(box_sum(counts * used.reshape(shape)[..., None], window, 1), -1, 0)
     known = not noise.integrated
     root = flat.illumination[0].astype(np.complex128) if shared and len(used) else None
     if known and isinstance(gain, UnitGain):
         total = _sums(own, window, shape, pixels, root)
         return Pooled(lambda chosen: Statistics(*(x[chosen] for x in total)), own, pixels, data, rank)
-    exact = not _is_strong(own, window, shape)
-    if known and isinstance(gain, ComplexGain) and root is not None and exact and window.rows * window.columns > 4:
+    summable = known and isinstance(gain, ComplexGain) and window.rows * window.columns > 4
+    if summable and root is not None and not _loses_digits(_frame(_power(own.response), shape, window, 0)):
         take = _moments(own, window, shape, pixels, root)
     else:
         take = _members(own, window, shape)
@@ -213,9 +212,8 @@ def _frame(values: np.ndarray, shape: tuple[int, ...], window: Window, trailing:
     return box_sum(values.reshape(shape + tail), window, trailing).reshape(-1, *tail)
 
 
-def _is_strong(own: Statistics, window: Window, shape: tuple[int, ...]) -> bool:
-    """Whether sums of squares over a window would lose more than about 1e-4 nat to rounding."""
-    power = _frame(_power(own.response), shape, window, 0)
+def _loses_digits(power: np.ndarray) -> bool:
+    """Whether differences of the sums ``power`` of squares lose more than about 1e-4 nat to rounding."""
     return bool(np.max(power, initial=0) * np.finfo(float).eps > 1e-5)
 
 
@@ -228,19 +226,23 @@ def _sums(
 ) -> Statistics:
     """Statistics of a window of pixels that share J, gain 1."""
     complex_type, real_type = own.response.dtype, own.residual.dtype
-    power, residual, constant, count = (
-        _frame(x, shape, window, 0) for x in (_power(own.response), own.residual, own.constant, own.count)
-    )
+    scalars = [_power(own.response), own.residual, own.constant, own.count]
+    # all sums in one go: for small frames it is the calls that take time
     if root is not None:
+        parts = own.response.astype(np.complex128, copy=False).reshape(-1, 4)
+        columns = np.concatenate([np.stack(scalars, axis=-1), parts.real, parts.imag], axis=-1)
+        total = _frame(columns, shape, window, 1).T
+        power, residual, constant, count = total[:4]
         number = np.sqrt(pixels.reshape(-1))[:, None, None]
-        total = _frame(own.response, shape, window, 2)
-        response, illumination = total / np.where(number > 0, number, 1), number * root
+        response = (total[4:8] + 1j * total[8:]).T.reshape(-1, 2, 2) / np.where(number > 0, number, 1)
+        illumination = number * root
     else:
+        power, residual, constant, count = _frame(np.stack(scalars, axis=-1), shape, window, 1).T
         adjoint = np.conj(np.swapaxes(own.illumination, -1, -2)).astype(np.complex128)
         gram = _frame(own.illumination.astype(np.complex128) @ adjoint, shape, window, 2)
         cross = _frame(own.response.astype(np.complex128) @ adjoint, shape, window, 2)
         illumination, response = _solve(gram, cross)
-    if _is_strong(own, window, shape):
+    if _loses_digits(power):
         spread = _spread(own, window, shape, Statistics(illumination, response, residual, constant, count))
     else:
         spread = np.maximum(power - _power(response), 0)

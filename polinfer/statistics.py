@@ -164,9 +164,10 @@ def _orthonormalise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _by_pixel(values: np.ndarray, shape: tuple[int, ...], trailing: int) -> np.ndarray:
     """Values with one leading axis: as long as there are pixels, or 1 where all pixels share them."""
-    tail = values.shape[values.ndim - trailing :]
-    if values.size == int(np.prod(tail)):
-        return values.reshape(1, *tail)
+    lead = values.ndim - trailing
+    tail = values.shape[lead:]
+    if values.size and all(n == 1 or step == 0 for n, step in zip(values.shape[:lead], values.strides, strict=False)):
+        return values[(slice(0, 1),) * lead].reshape(1, *tail)
     return np.broadcast_to(values, shape + tail).reshape(-1, *tail)
 
 
@@ -192,7 +193,7 @@ def summarise(measurement: Measurement, sigma: np.ndarray | None) -> Summary:
     weight = np.ones(n) if measurement.weight is None else measurement.weight.astype(np.float64)
     root_weight = _by_pixel(np.sqrt(weight), shape, 1)
     used = root_weight > 0
-    scale = _by_pixel(np.ones(()) if sigma is None else np.asarray(sigma, np.float64), shape, 0)
+    scale = _by_pixel(np.ones(()) if sigma is None else sigma, shape, 0).astype(np.float64)
     states = used.sum(axis=-1)
     constant = 4 * np.sum(np.log(np.where(used, root_weight, 1.0)), axis=-1) - 2 * states * np.log(np.pi * scale**2)
     illumination = _by_pixel(measurement.illumination, shape, 2)

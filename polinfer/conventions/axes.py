@@ -89,7 +89,7 @@ def retarder_parameters(retardance: Any, azimuth: Any, ellipticity: Any, flip_ve
     """Canonical parameters (D = 0) of the retarder with this fast eigenstate, the reverse of retarder_arguments.
 
     >>> [round(float(x), 3) for x in retarder_parameters(1.0, np.pi / 2 - 0.3, 0.0, False)]
-    [0.0, 0.0, 1.0, 0.3, 0.0]
+    [0.0, 1.571, 1.0, 0.3, 0.0]
     """
     retardance, azimuth, ellipticity = np.asarray(retardance), np.asarray(azimuth), np.asarray(ellipticity)
     along, diagonal = np.cos(2 * ellipticity) * np.cos(2 * azimuth), np.cos(2 * ellipticity) * np.sin(2 * azimuth)
@@ -131,7 +131,7 @@ def diattenuator_parameters(largest: np.ndarray, least: np.ndarray, azimuth: Any
     """Canonical parameters (no retardance) of a diattenuator; NaN where it transmits nothing.
 
     >>> [round(float(x), 3) for x in diattenuator_parameters(np.array(0.5), np.array(0.3), -0.3, False)]
-    [0.25, 0.3, 0.0, 0.0, 0.0]
+    [0.25, 0.3, 0.0, 1.571, 0.0]
     """
     with np.errstate(invalid="ignore"):
         diattenuation = np.asarray((largest - least) / (largest + least))

@@ -43,8 +43,8 @@ def evaluate(scene: Scene, data: Data, point: Point) -> tuple[Any, Residual]:
         [tuple(_product(seen[i], [data.illumination[k][j] for k in (0, 1)], part) for part in (0, 1)) for j in (0, 1)]
         for i in (0, 1)
     ]
-    at = scene.likelihood.residual(model, data.response)  # type: ignore[arg-type]
-    value = scene.likelihood.value(at, data.residual, data.count) + data.constant
+    at = scene.likelihood.residual(model, data.response)
+    value = scene.likelihood.value(at) + data.constant
     return value + (log_prior(scene.prior, point) + scene.constant), at
 
 
@@ -56,7 +56,7 @@ def _product(row: list[Any], column: list[Any], part: int) -> Any:
 
 def derivatives(scene: Scene, balanced: bool, data: Data, point: Point, at: Residual) -> Posterior:
     """Gradient and Hessian of the log likelihood by the free angles (without the prior)."""
-    slopes: Slopes = scene.likelihood.slopes(at, data.residual, data.count)
+    slopes: Slopes = scene.likelihood.slopes(at)
     k = data.product
     if scene.likelihood.free_phase:
         k = turned(k, unit(*at.gain))
@@ -175,7 +175,6 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
     """At most ``iterations`` damped Newton steps uphill, none of which lowers the density."""
     eps = jnp.finfo(data.strength.dtype).eps
     enough = precise_enough(data)
-    rounding = 20 * eps * (1 + data.strength)
     free = scene.free
 
     def advance(carry: Any) -> Any:
@@ -210,7 +209,9 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         return (carry[0] < iterations) & ~jnp.all(carry[4])
 
     point = better_copy(scene, point)
-    value, _ = evaluate(scene, data, point)
+    value, at = evaluate(scene, data, point)
+    # the residual is rounded like eps times the signal-to-noise ratio, and is squared
+    rounding = 10 * eps * (1 + data.strength) * jnp.sqrt(1 + at.square) / data.one
     zero = jnp.zeros_like(value)
     carry = (jnp.zeros((), jnp.int32), point, value, zero, jnp.zeros(value.shape, bool))
     return jax.lax.while_loop(unfinished, advance, carry)[1]

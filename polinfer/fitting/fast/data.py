@@ -26,7 +26,6 @@ class Data(NamedTuple):
     response: Matrix
     residual: Any
     constant: Any
-    count: Any
     product: Pauli
     power: Pauli
     jones: Pauli
@@ -48,9 +47,7 @@ def times_adjoint(a: Matrix, b: Matrix) -> Matrix:
     return [[_sum(_times(a[i][0], b[j][0]), _times(a[i][1], b[j][1])) for j in (0, 1)] for i in (0, 1)]
 
 
-def prepare(
-    balanced: bool, illumination: Matrix, response: Matrix, residual: Any, constant: Any, count: Any, one: Any
-) -> Data:
+def prepare(balanced: bool, illumination: Matrix, response: Matrix, residual: Any, constant: Any, one: Any) -> Data:
     """What the climb needs of R, Y and the rest; ``balanced`` says that S is proportional to the identity."""
     product = times_adjoint(response, illumination)
     power = times_adjoint(illumination, illumination)
@@ -67,7 +64,6 @@ def prepare(
         response,
         residual,
         constant,
-        count,
         _kept(one, pauli(product)),
         pauli(power),
         _kept(one, pauli(jones)),

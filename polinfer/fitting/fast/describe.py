@@ -25,7 +25,7 @@ FROZEN = {0: 8, 2: 16}  # the maximum lies on a bound of the diattenuation, of t
 MANY = 0.02  # variance of the angles of J (rad^2) beyond which the closed form may start in the wrong valley
 
 # rows of the result, each an array of pixels
-ROWS = {"parameters": slice(0, 5), "std": slice(5, 10), "covariance": slice(10, 35)}
+ROWS: dict[str, Any] = {"parameters": slice(0, 5), "std": slice(5, 10), "covariance": slice(10, 35)}
 ROWS |= {"log_posterior": 35, "log_evidence": 36, "chi_square": 37, "slope_0": 38, "slope_2": 39}
 ROWS |= {"gain_real": 40, "gain_imaginary": 41}
 
@@ -67,8 +67,10 @@ def _choose(scene: Scene, point: Point, values: Parameters) -> tuple[Parameters,
             if not row or move in seen:
                 continue
             seen.append(move)
-            part = tuple(scene.prior[i].transformed(*copy[i]) if i in indices and scene.prior[i] is not None else None
-                         for i in range(5))  # type: ignore[union-attr]  # fmt: skip
+            part = tuple(
+                None if term is None or i not in indices else term.transformed(*copy[i])
+                for i, term in enumerate(scene.prior)
+            )
             prior = log_prior(part, point)
             candidate, far = [], 0.0
             for name, (sign, shift) in zip(names, move, strict=True):

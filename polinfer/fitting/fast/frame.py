@@ -280,7 +280,7 @@ def _as_fit(
         covariance=covariance,
         log_posterior=rows[ROWS["log_posterior"]],
         log_evidence=rows[ROWS["log_evidence"]],
-        sigma=np.array(np.broadcast_to(model.noise.sigma(measurement), shape), rows.dtype),
+        sigma=np.array(np.broadcast_to(np.asarray(model.noise.sigma(measurement)), shape), rows.dtype),
         gain=gain,
         status=status.reshape(shape),
         chi_square=rows[ROWS["chi_square"]],

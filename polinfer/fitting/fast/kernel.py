@@ -60,7 +60,6 @@ def from_statistics(
         _parts(statistics.response),
         statistics.residual,
         statistics.constant,
-        statistics.count,
         one,
     )
     return _finish(scene, balanced, data, start, given, iterations)
@@ -113,5 +112,5 @@ def from_responses(
             residual = residual + re * re + im * im
     constant = shared.log_weight - shared.count * jnp.log(pi * sigma * sigma) - residual
     root = [[(re * inverse, im * inverse) for re, im in row] for row in _parts(shared.root)]
-    data = prepare(balanced, root, y, residual, constant, shared.count, one)
+    data = prepare(balanced, root, y, residual, constant, one)
     return _finish(scene, balanced, data, start, given, iterations)

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from ...circular import bessel_ratio, log_scaled_bessel
 from ...gain import ComplexGain, PhaseGain
 from ...model import Model
+from ...noise import KnownNoise
 from .point import Pair, unit
 
-__all__ = ["Complex", "Inferred", "Likelihood", "Phase", "Residual", "Slopes", "Unit", "likelihood"]
+__all__ = ["Complex", "Likelihood", "Phase", "Residual", "Slopes", "Unit", "likelihood"]
 
 
 class Residual(NamedTuple):
@@ -73,11 +74,11 @@ class Unit:
         """What the other methods need of a matrix."""
         return Residual((1.0, 0.0), _square(model, data, None), None, (None, None))
 
-    def value(self, at: Residual, residual: Any, count: Any) -> Any:  # noqa: ARG002
+    def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""
         return -at.square
 
-    def slopes(self, at: Residual, residual: Any, count: Any) -> Slopes:  # noqa: ARG002
+    def slopes(self, at: Residual) -> Slopes:  # noqa: ARG002
         """Its derivatives."""
         return Slopes(2.0, -1.0)
 
@@ -98,14 +99,14 @@ class Phase:
         gain = unit(*a)
         return Residual(gain, _square(model, data, gain), _energy(model), a)
 
-    def value(self, at: Residual, residual: Any, count: Any) -> Any:  # noqa: ARG002
+    def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""
         return -at.square + log_scaled_bessel(2 * self._size(at))
 
     def _size(self, at: Residual) -> Any:
         return at.overlap[0] * at.gain[0] + at.overlap[1] * at.gain[1]
 
-    def slopes(self, at: Residual, residual: Any, count: Any) -> Slopes:  # noqa: ARG002
+    def slopes(self, at: Residual) -> Slopes:
         """Its derivatives."""
         x = 2 * self._size(at)
         far = x > 20.0
@@ -137,12 +138,12 @@ class Complex:
         gain = (a[0] * weight, a[1] * weight)
         return Residual(gain, _square(model, data, gain), m, a)
 
-    def value(self, at: Residual, residual: Any, count: Any) -> Any:  # noqa: ARG002
+    def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""
         penalty = self.precision * (at.gain[0] * at.gain[0] + at.gain[1] * at.gain[1])
         return -at.square - penalty - jnp.log1p(at.energy / self.precision)
 
-    def slopes(self, at: Residual, residual: Any, count: Any) -> Slopes:  # noqa: ARG002
+    def slopes(self, at: Residual) -> Slopes:
         """Its derivatives."""
         weight = 1 / (at.energy + self.precision)
         r = jnp.sqrt(at.overlap[0] * at.overlap[0] + at.overlap[1] * at.overlap[1])
@@ -157,40 +158,12 @@ class Complex:
         return at.gain
 
 
-@dataclass(frozen=True)
-class Inferred:
-    """g = 1 and sigma^2 inverse gamma: ``-(shape + N) log(scale + |M - Y|^2 + E)``."""
-
-    shape: float
-    scale: float
-    free_phase = False
-
-    def residual(self, model: list[list[Pair]], data: list[list[Pair]]) -> Residual:
-        """What the other methods need of a matrix."""
-        return Residual((1.0, 0.0), _square(model, data, None), None, (None, None))
-
-    def value(self, at: Residual, residual: Any, count: Any) -> Any:
-        """Log likelihood without the statistics' constant and what depends on the count alone."""
-        return -(self.shape + count) * jnp.log(self.scale + at.square + residual)
-
-    def slopes(self, at: Residual, residual: Any, count: Any) -> Slopes:
-        """Its derivatives."""
-        order = self.shape + count
-        weight = order / (self.scale + at.square + residual)
-        bend = weight * weight / order
-        return Slopes(2 * weight, -weight, 4 * bend, -2 * bend, bend)
-
-    def mean_gain(self, at: Residual) -> Pair | None:  # noqa: ARG002
-        """Posterior mean of the gain, None: there is none."""
-        return None
-
-
-Likelihood = Unit | Phase | Complex | Inferred
+Likelihood = Unit | Phase | Complex
 
 
 def likelihood(model: Model) -> Likelihood | None:
     """The likelihood of a model, or None where there is no fast form."""
-    if type(model.noise).__name__ != "KnownNoise":
+    if type(model.noise) is not KnownNoise:
         return None
     if model.gain is None:
         return Unit()

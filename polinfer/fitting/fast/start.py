@@ -29,23 +29,24 @@ def closed_form(scene: Scene, data: Data) -> Point:
     y = -scale * (_mix(k.one, k.x)[0] + sign * _mix(k.y, k.z)[1])
     value = jnp.minimum(jnp.sqrt(x * x + y * y), 0.999)
     cosine = jnp.sqrt(0.5 * (1 + jnp.sqrt(1 - value * value)))
-    polariser = [_fixed(scene, 0, (cosine, 0.5 * value / cosine)), _fixed(scene, 1, unit(x, y))]
-    (c, s), (a, b) = polariser
+    first, second = _fixed(scene, 0, (cosine, 0.5 * value / cosine)), _fixed(scene, 1, unit(x, y))
+    (c, s), (a, b) = first, second
     u = [c, s * a, s * b]
     # seen through the polariser the matrix is a complex quaternion; the retarder is its real part
     q = _quaternion(scene.retarder_first, k, u)
     if scene.likelihood.free_phase:
         other = _quaternion(scene.retarder_first, _imaginary(k), u)
         half = _half_phase(q, other)
-        q = [half[0] * real + half[1] * rest for real, rest in zip(q, other, strict=True)]
+        q = [half[0] * part + half[1] * rest for part, rest in zip(q, other, strict=True)]
         down = q[0] < 0
         q = [jnp.where(down, -part, part) for part in q]
-    first = jnp.maximum(q[0], 0) if scene.bounded else q[0]
+    real = jnp.maximum(q[0], 0) if scene.bounded else q[0]
     flip = jnp.where(q[2] < 0, -1.0, 1.0).astype(value.dtype)  # circularity within a quarter turn of 0
     rho = flip * jnp.sqrt(q[2] * q[2] + q[3] * q[3])
     return Point(
-        *polariser,
-        _fixed(scene, 2, unit(first, jnp.sqrt(q[1] * q[1] + rho * rho))),
+        first,
+        second,
+        _fixed(scene, 2, unit(real, jnp.sqrt(q[1] * q[1] + rho * rho))),
         _fixed(scene, 3, unit(q[1], rho)),
         _fixed(scene, 4, unit(flip * q[2], flip * q[3])),
     )
