@@ -74,21 +74,34 @@ def cramer_rao_bound(model: Model, parameters: Parameters, illumination: Any, si
     count = len(model.free)
     extra = model.known_gain.real_parameters
     points = np.zeros((*shape, count + extra))
+    slope = np.ones((*shape, count + extra))
+    clipped = np.zeros(shape, bool)
     for i, name in enumerate(model.free):
         points[..., i] = values[name]
+        if name == "diattenuation":
+            # at |D| = 1 the derivative by D is infinite, by delta (D = sin delta) it is not: just inside it is the same
+            inside = 1 - float(jnp.finfo(jnp.result_type(float)).eps) ** 0.5
+            points[..., i] = np.clip(points[..., i], -inside, inside)
+            clipped = np.broadcast_to(np.abs(values[name]) > inside, shape)
+            slope[..., i] = np.sqrt(1 - points[..., i] ** 2)
     states = np.broadcast_to(illumination, (*shape, *illumination.shape[-2:]))
     jacobian = np.asarray(
         _jacobian(model, points.reshape(-1, count + extra), states.reshape(-1, *states.shape[-2:])), float
     )
+    jacobian = jacobian * slope.reshape(-1, 1, count + extra)
     _, singular, axes = np.linalg.svd(jacobian, full_matrices=False)
     eps = np.finfo(jnp.result_type(float)).eps
     # numbers of data below those of unknowns leave directions without any singular value
     missing = np.maximum(0.0, 1.0 - np.sum(axes**2, axis=-2))
-    lost = singular <= 100 * eps * singular.max(axis=-1, keepdims=True)
+    # what vanishes like sqrt(1 - |D|) towards |D| = 1 is still eps^(1/4) just inside
+    least = np.where(clipped, 10 * eps**0.25, 100 * eps).reshape(-1, 1)
+    lost = singular <= least * singular.max(axis=-1, keepdims=True)
     inverse = np.where(lost, 0, 1 / np.where(lost, 1, singular))
     variance = 0.5 * np.sum((axes * inverse[..., None]) ** 2, axis=-2)
     missing = missing + np.sum(axes**2 * lost[..., None], axis=-2)
     std = np.where(missing > 1e-6, np.inf, np.sqrt(variance)).reshape(*shape, -1) * sigma[..., None]
     result = {name: np.zeros(shape) for name in model.fixed} | {name: np.full(shape, np.inf) for name in model.dropped}
     result |= {name: std[..., i] for i, name in enumerate(model.free)}
+    if "diattenuation" in model.free:
+        result["diattenuation"] = result["diattenuation"] * np.sqrt(1 - np.square(values["diattenuation"]))
     return Parameters(**result)

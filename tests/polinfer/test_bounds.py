@@ -85,7 +85,7 @@ def test_every_pixel_has_its_own_point_states_and_sigma():
 
 
 @pytest.mark.parametrize("ordering", list(ORDERINGS))
-@pytest.mark.parametrize("diattenuation", [-0.999, -0.5, 0.0, 0.9, 1 - 1e-8])
+@pytest.mark.parametrize("diattenuation", [-0.999, -0.5, 0.0, 0.9, 1 - 1e-8, 1 - 1e-12, 1.0, -1.0])
 def test_diattenuation_has_the_bound_of_the_closed_form_at_any_size(ordering, diattenuation):
     for gain in GAINS.values():
         bound = cramer_rao_bound(Model(ORDERINGS[ordering], gain=gain), Parameters(diattenuation, *EVERYWHERE[1:]),
