@@ -352,12 +352,12 @@ def test_with_flat_priors_the_copy_reported_is_the_canonical_one(gain):
             *(f * v for f, v in zip(priors.FACTORS[1:], own[1:], strict=True)),
         ]
         here = as_point(angles)
-        found, signs = describe._choose(known, here, describe._values(known, here))
+        found, signs = describe._choose(known, 1.0, here, describe._values(known, here))
         np.testing.assert_allclose(np.stack([np.asarray(v) for v in found]), expected, atol=1e-12, err_msg=str(k))
         # the sign of a parameter is how it changes with the angle that it was found at
         change = np.stack([np.asarray(signs[i]) for i in range(5)])
         moved = as_point(np.stack(angles)[:, :500] + 1e-5)
-        near, _ = describe._choose(known, moved, describe._values(known, moved))
+        near, _ = describe._choose(known, 1.0, moved, describe._values(known, moved))
         step = np.stack([np.asarray(v) for v in near]) - np.stack([np.asarray(v) for v in found])[:, :500]
         sure = (np.abs(step) < 1e-3).all(axis=0)
         assert sure.mean() > 0.95

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from math import log, pi
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from ...degeneracy import REFERENCE
 from ...records import PERIODS, Parameters
 from ..local_gaussian import uniform_std
 from .climb import derivatives, evaluate, frozen, held, kept, precise_enough, with_prior
@@ -47,62 +49,75 @@ def _lexicographic(left: list[Any], right: list[Any], slack: float) -> Any:
     return found
 
 
-def _choose(scene: Scene, point: Point, values: Parameters) -> tuple[Parameters, dict[int, Any]]:
+def _choose(scene: Scene, one: Any, point: Point, values: Parameters) -> tuple[Parameters, dict[int, Any]]:
     """Of the copies with the highest prior the canonical one, and the sign of every angle in it.
 
     Distance and prior are sums over the two elements, so each chooses for itself.
     """
-    eps = float(jnp.finfo(values.diattenuation.dtype).eps)
-    slack, room = 64 * eps, 1e-6 if eps < 1e-10 else 1e-3
-    reference = Parameters(1.0, pi / 4, pi, pi / 4, 0.0)
-    weights = Parameters(1.0, 2.0, 1.0, 2.0, 1.0)
     out: dict[str, Any] = {}
     signs: dict[int, Any] = {}
     for indices in ((0, 1), (2, 3, 4)):
-        names = [Parameters._fields[i] for i in indices]
-        best: Any = None
-        seen = []
+        moves, candidates = [], []
         for row, copy in zip(scene.copies, COPIES, strict=True):
             move = tuple(copy[i] for i in indices)
-            if not row or move in seen:
-                continue
-            seen.append(move)
-            part = tuple(
-                None if term is None or i not in indices else term.transformed(*copy[i])
-                for i, term in enumerate(scene.prior)
-            )
-            prior = log_prior(part, point)
-            candidate, far = [], 0.0
-            for name, (sign, shift) in zip(names, move, strict=True):
-                value = sign * getattr(values, name)
-                if name != "diattenuation":
-                    factor, period = getattr(FACTORS, name), getattr(PERIODS, name)
-                    if shift:
-                        value = value + shift / factor
-                        value = jnp.where(value > 0.5 * period, value - period, value)
-                    if sign < 0 and name != "retardance":
-                        value = _wrap(value, period)
-                    weight = getattr(weights, name)
-                    far = far + _wrap(weight * (value - getattr(reference, name)), 2 * pi) ** 2
-                else:
-                    far = far + (value - reference.diattenuation) ** 2
-                candidate.append(value)
-            sign_of = [jnp.full_like(point.diattenuation[0], float(sign)) for sign, _ in move]
-            if best is None:
-                best = (prior, far, candidate, sign_of)
-                continue
-            tied = jnp.abs(far - best[1]) <= slack * (1 + best[1])
-            nearer = jnp.where(tied, _lexicographic(candidate, best[2], 4 * eps), far < best[1])
-            better = jnp.where(jnp.abs(prior - best[0]) <= room, nearer, prior > best[0])
-            best = tuple(
-                [jnp.where(better, a, b) for a, b in zip(new, old, strict=True)]
-                if isinstance(new, list)
-                else jnp.where(better, new, old)
-                for new, old in zip((prior, far, candidate, sign_of), best, strict=True)
-            )
-        for i, name, value, sign in zip(indices, names, best[2], best[3], strict=True):
-            out[name], signs[i] = value, sign
+            if row and move not in moves:
+                moves.append(move)
+                candidates.append(_candidate(scene, indices, copy, point, values))
+        chosen = _best(candidates, values) / one
+        for m, i in enumerate(indices):
+            value, sign = candidates[0].values[m], jnp.full_like(chosen, moves[0][m][0])
+            for k in range(1, len(moves)):
+                value = jnp.where(chosen == k, candidates[k].values[m], value)
+                sign = jnp.where(chosen == k, moves[k][m][0], sign)
+            out[Parameters._fields[i]], signs[i] = value, sign
     return Parameters(**out), signs
+
+
+class _Candidate(NamedTuple):
+    """Parameters of one element, their log prior and their squared distance from the reference."""
+
+    values: list[Any]
+    prior: Any
+    distance: Any
+
+
+def _candidate(
+    scene: Scene, indices: tuple[int, ...], copy: tuple[tuple[int, float], ...], point: Point, values: Parameters
+) -> _Candidate:
+    part = tuple(
+        None if term is None or i not in indices else term.transformed(*copy[i]) for i, term in enumerate(scene.prior)
+    )
+    found, far = [], 0.0
+    for i in indices:
+        name, (sign, shift) = Parameters._fields[i], copy[i]
+        value = sign * values[i]
+        if name == "diattenuation":
+            far = far + (value - REFERENCE.diattenuation) ** 2
+        else:
+            period = PERIODS[i]
+            if shift:
+                value = value + shift / FACTORS[i]
+                value = jnp.where(value > 0.5 * period, value - period, value)
+            if sign < 0 and name != "retardance":
+                value = _wrap(value, period)
+            weight = 2.0 if period < 2 * pi else 1.0  # angles of axes count double
+            far = far + _wrap(weight * (value - REFERENCE[i]), 2 * pi) ** 2
+        found.append(value)
+    return _Candidate(found, log_prior(part, point), far)
+
+
+def _best(candidates: list[_Candidate], values: Parameters) -> Any:
+    """Number of the candidate that :func:`polinfer.canonicalise` would take of those with the highest prior."""
+    eps = float(jnp.finfo(values.diattenuation.dtype).eps)
+    slack, room = 64 * eps, 1e-6 if eps < 1e-10 else 1e-3
+    best, number = candidates[0], jnp.zeros_like(values.diattenuation)
+    for k, new in enumerate(candidates[1:], start=1):
+        tied = jnp.abs(new.distance - best.distance) <= slack * (1 + best.distance)
+        nearer = jnp.where(tied, _lexicographic(new.values, best.values, 4 * eps), new.distance < best.distance)
+        better = jnp.where(jnp.abs(new.prior - best.prior) <= room, nearer, new.prior > best.prior)
+        best = jax.tree.map(partial(jnp.where, better), new, best)
+        number = jnp.where(better, k, number)
+    return number
 
 
 def _values(scene: Scene, point: Point) -> Parameters:
@@ -182,8 +197,7 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
             c[m, k] = c[k, m] = jnp.where(where, follow[k], c[k, m])
         c[m, m] = jnp.where(where, 1 / curvature, c[m, m])
 
-    parameters, signs = _choose(scene, point, _values(scene, point))
-    parameters, signs = jax.tree.map(lambda x: x / data.one, (parameters, signs))
+    parameters, signs = _choose(scene, data.one, point, _values(scene, point))
     widths = [2 * cosine, 0.5, 2.0, 0.5, 1.0]
     if 0 in stuck:
         widths[0] = jnp.where(stuck[0], 1.0, widths[0])
