@@ -26,6 +26,7 @@ from .student import total_power, widen
 __all__ = ["DESIGN", "DESIGN_WARM", "Part", "Prepared", "chunk_size", "fit_chunk", "prepare"]
 
 CHUNK = 2048  # pixels whose starting points are in memory at once
+LEAST = 64
 ITERATIONS = 60
 DESIGN, DESIGN_WARM = 6, 2  # starts from the design, without and with an earlier fit
 
@@ -172,8 +173,8 @@ def fit_chunk(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None
     model, dtype, count = prepared.model, prepared.measurement.response.dtype, len(chosen)
     host: Statistics | Windowed = prepared.pooled.take(chosen)
     own = Statistics(*(x[chosen] for x in prepared.pooled.own))
-    # code is compiled for a shape: pad to a power of two, so that few shapes occur
-    size = 1 << (count - 1).bit_length()
+    # code is compiled for a shape: pad to a power of two, and not to small ones, so that few shapes occur
+    size = max(1 << (count - 1).bit_length(), LEAST)
     fill = np.concatenate([np.arange(count), np.zeros(size - count, int)])
     host, own = (jax.tree.map(lambda x: x[fill], values) for values in (host, own))
     earlier = None if earlier is None else Parameters(*(x[fill] for x in earlier))

@@ -178,7 +178,9 @@ def test_a_residual_beyond_what_the_prior_of_sigma_expects_is_a_bad_fit():
     assert flagged[2] < 0.03
 
 
-@pytest.mark.parametrize("gain", GAINS)
+@pytest.mark.parametrize(
+    "gain", ["none", pytest.param("phase", marks=pytest.mark.slow), pytest.param("complex", marks=pytest.mark.slow)]
+)
 def test_the_sigma_of_a_frame_is_found(gain):
     scene = polinfer.phantoms.lesion((12, 12), rng=1)
     model = Model(gain=GAINS[gain], noise=InferredNoise(1e-3, 1e-9, "frame"))
@@ -240,6 +242,7 @@ def test_the_frame_of_a_fit_is_the_maximum_of_the_summed_evidence():
     assert 2 * middle - high - low > 0
 
 
+@pytest.mark.slow  # four models to compile
 def test_complex64_gives_float32_for_either_scope():
     scene = polinfer.phantoms.lesion((4, 5), rng=1)
     measurement = simulate(Model(), scene.parameters, BALANCED.astype(np.complex64), 0.02, rng=2)
