@@ -317,6 +317,7 @@ def test_the_closed_form_of_a_matrix_without_noise_is_exact(ordering, gain):
     for balanced, seen in ((False, root), (True, np.broadcast_to(3.0 * np.eye(2), root.shape))):
         statistics = Statistics(seen, phase * matrices @ seen, nothing, nothing, nothing)
         found = start.closed_form(known, prepared(statistics, balanced))
+        assert (np.asarray(found.circularity[0]) >= 0).all()  # of the two copies the one that the default prior likes
         u, q = point.polariser_vectors(found)[0], point.retarder_vectors(found)[0]
         parts = point.matrix(ordering == "retarder_first", u, q)
         ours = np.stack([np.stack([np.asarray(a + 1j * b) for a, b in row], -1) for row in parts], -2)
