@@ -8,8 +8,8 @@ import inspect
 
 import jax
 
-QUICK = ("speed", "optimum", "evidence", "accuracy", "hard_cases", "parts", "retrieval")
-ALL = (*QUICK, "peers", "chain")
+QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
+ALL = (*QUICK, "inference", "chain")
 
 
 def main() -> None:

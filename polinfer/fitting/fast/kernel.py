@@ -41,7 +41,10 @@ def _parts(a: Any) -> Matrix:
 
 def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, iterations: Any) -> tuple[Any, Any]:
     closed = closed_form(scene, data)
-    told = Point(*((start[2 * i], start[2 * i + 1]) for i in range(5)))
+    # a start may come from another model: what is fixed stays
+    told = Point(
+        *((start[2 * i], start[2 * i + 1]) if known is None else closed[i] for i, known in enumerate(scene.fixed))
+    )
     point = jax.tree.map(partial(jnp.where, given), told, closed)
     return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations))
 

@@ -47,7 +47,10 @@ def scene(model: Model) -> Scene | None:
     kind, prior = likelihood(model), terms(model)
     shipped = type(model.ordering) in (RetarderFirst, PolariserFirst)
     bounds = all(BOUNDS.get(name) == pair for name, pair in model.bounds.items())
-    if kind is None or prior is None or not shipped or not bounds or not model.free:
+    # of a retarder of which only some parameters are known the closed form is too poor a start
+    retarder = {"retardance", "retardance_angle", "circularity"} & set(model.fixed)
+    partly = bool(retarder) and model.fixed.get("retardance") != 0
+    if kind is None or prior is None or not shipped or not bounds or not model.free or partly:
         return None
     rows = distinct_copies(model)
     counts: dict[tuple[Term | None, ...], int] = {prior: 0}
