@@ -48,8 +48,15 @@ def _random_rule(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return points, 0.5 * np.sum((points / WIDER) ** 2, axis=0) + 5 * log(WIDER * sqrt(2 * pi)) - SOBOL * log(2)
 
 
-def _sum(oracle: Oracle, centre: np.ndarray, root: np.ndarray, rule: tuple[np.ndarray, np.ndarray],
-         response: np.ndarray, illumination: np.ndarray, sigma: float) -> tuple[float, np.ndarray, np.ndarray]:  # fmt: skip
+def _sum(
+    oracle: Oracle,
+    centre: np.ndarray,
+    root: np.ndarray,
+    rule: tuple[np.ndarray, np.ndarray],
+    response: np.ndarray,
+    illumination: np.ndarray,
+    sigma: float,
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Log evidence, mean and covariance from nodes around a centre."""
     moved = centre[:, None] + root @ rule[0]
     point = np.concatenate([np.sin(moved[:1]), moved[1:]])

@@ -89,7 +89,7 @@ def main() -> None:
         peer_seconds = (time.perf_counter() - begin) / SUBSET
         closed = polinfer.decompose(jones, RetarderFirst())
         found = {
-            "fit (generic)": (fitted.parameters, median_seconds(lambda d=data: polinfer.fit(model, d)) / PIXELS),
+            "fit": (fitted.parameters, median_seconds(lambda d=data: polinfer.fit(model, d)) / PIXELS),
             "decompose": (
                 closed,
                 median_seconds(lambda j=jones: polinfer.decompose(j, RetarderFirst())) / PIXELS,
@@ -111,7 +111,7 @@ def main() -> None:
                 below_best_percent=float(100 * np.mean(density[name] < best - 0.1)),
                 compile_seconds=first if name.startswith("fit") else float("nan"),
             )
-    results.save("microseconds_a_pixel", "error_over_bound", "method")
+    results.save(results.lines("microseconds_a_pixel", "error_over_bound", "method"))
 
 
 if __name__ == "__main__":

@@ -193,7 +193,11 @@ class Oracle:
                 q2 = a2.real if self.gain == "unit" else (
                     (a1[i].conj() * a1[j]).real + (a.conj() * a2).real) / q - q1[i] * q1[j] / q  # fmt: skip
                 curvature[i, j] = curvature[j, i] = (
-                    fp * p2 + fq * q2 + fpp * p1[i] * p1[j] + fpq * (p1[i] * q1[j] + q1[i] * p1[j]) + fqq * q1[i] * q1[j]
+                    fp * p2
+                    + fq * q2
+                    + fpp * p1[i] * p1[j]
+                    + fpq * (p1[i] * q1[j] + q1[i] * p1[j])
+                    + fqq * q1[i] * q1[j]
                 )
         slope[0] += 2 * np.sin(2 * angles[0])
         slope[4] += np.sin(angles[4])
