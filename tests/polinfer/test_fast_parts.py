@@ -170,7 +170,7 @@ def density_derivatives(model):
         ("retarder_first", "complex", HARD, {}, False),
         ("polariser_first", "none", HARD, {}, True),
         ("polariser_first", "phase", HARD, {}, False),
-        ("polariser_first", "complex", {}, {"retardance_angle": 0.4}, False),
+        ("polariser_first", "complex", {}, {"diattenuation_angle": 0.4}, False),
     ],
 )
 def test_derivatives_of_the_log_posterior_are_those_of_the_model(ordering, gain, chosen, fixed, balanced):
@@ -329,12 +329,12 @@ def test_the_closed_form_of_a_matrix_without_noise_is_exact(ordering, gain):
 
 
 def test_fixed_angles_are_in_place_in_the_closed_form():
-    model = Model(fixed={"diattenuation": -0.4, "retardance_angle": 0.3})
+    model = Model(fixed={"diattenuation": -0.4, "diattenuation_angle": 0.3})
     known = scene.scene(model)
     statistics = Statistics(random_matrix(5, 1), random_matrix(5, 2), *(np.zeros(5) for _ in range(3)))
     found = start.closed_form(known, prepared(statistics, False))
     np.testing.assert_allclose(2 * found.diattenuation[0] * found.diattenuation[1], -0.4)
-    np.testing.assert_allclose(np.arctan2(*found.retardance_angle[::-1]), 0.6)
+    np.testing.assert_allclose(np.arctan2(*found.diattenuation_angle[::-1]), 0.6)
 
 
 @pytest.mark.parametrize("gain", ["none", "phase"])
