@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,21 +84,25 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
         earlier = Parameters(*(np.asarray(x).reshape(-1) for x in start.parameters))
     if isinstance(model.noise, InferredNoise) and not model.noise.integrated:
         return _fit_frame(model, model.noise, measurement, earlier, progress)
-    found = fit_responses(model, measurement, earlier, progress, _fit_general)
+    found = fit_responses(model, measurement, earlier, progress, partial(_fit_general, fast=False))
     return _fit_general(model, measurement, earlier, progress) if found is None else found
 
 
-def _fit_general(model: Model, measurement: Measurement, earlier: Parameters | None, progress: bool) -> Fit:
-    """Fit by way of the statistics of every pixel or window."""
+def _fit_general(
+    model: Model, measurement: Measurement, earlier: Parameters | None, progress: bool, fast: bool = True
+) -> Fit:
+    """Fit by way of the statistics of every pixel or window; without ``fast`` by the general route alone."""
     prepared = prepare(model, measurement, model.noise.integrated)
-    parts = list(_parts(prepared, earlier, DESIGN if earlier is None else DESIGN_WARM, progress))
+    parts = list(_parts(prepared, earlier, DESIGN if earlier is None else DESIGN_WARM, progress, fast))
     return _assemble(model, prepared, model.noise.sigma(measurement), parts, earlier is not None)
 
 
-def _parts(prepared: Prepared, earlier: Parameters | None, design: int | None, progress: bool) -> Iterable[Part]:
+def _parts(
+    prepared: Prepared, earlier: Parameters | None, design: int | None, progress: bool, fast: bool = True
+) -> Iterable[Part]:
     """Fits of all good pixels, chunk by chunk; ``earlier`` are parameters of all pixels."""
     model, good = prepared.model, prepared.good
-    known = None if len(good) == 0 else fast_scene(model)
+    known = fast_scene(model) if fast and len(good) else None
     size = chunk_size(model) if known is None else FAST_CHUNK
     chunks: Any = range(0, len(good), size)
     if progress:

@@ -196,7 +196,6 @@ def test_fixed_values_are_kept_where_other_starts_are_tried(fixed):
     np.testing.assert_allclose(fast.log_posterior, at_maximum, atol=1e-8)
 
 
-@pytest.mark.xfail(strict=True, reason="of priors without symmetry only the other side of the circularity is tried")
 def test_of_two_copies_with_nearly_the_same_density_the_better_one_is_found():
     model = Model(priors=PRIORS)
     response = [

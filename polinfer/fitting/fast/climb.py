@@ -171,8 +171,17 @@ def better_copy(scene: Scene, point: Point) -> Point:
     return best
 
 
-def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any) -> Point:
-    """At most ``iterations`` damped Newton steps uphill, none of which lowers the density."""
+def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any, exchange: Any = True) -> Point:
+    """At most ``iterations`` damped Newton steps uphill, none of which lowers the density.
+
+    With ``exchange`` a point gives way to an equivalent one with a higher prior on the way.
+    """
+
+    def best(point: Point) -> Point:
+        if len(scene.groups) == 1:
+            return point
+        return jax.tree.map(partial(jnp.where, exchange), better_copy(scene, point), point)
+
     eps = jnp.finfo(data.strength.dtype).eps
     enough = precise_enough(data)
     free = scene.free
@@ -193,22 +202,23 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         lower, smallest = factorise(a, len(free), LEAST_CURVATURE)
         step, decrement = solve(lower, [slope.gradient[i] for i in free])
         decrement = decrement / data.one
-        done = done | ((decrement < enough) & (smallest > 0) & (damping == 0))
+        arrived = (decrement < enough) & (smallest > 0) & (damping == 0)
         pairs = list(point)
         for i, x in zip(free, step, strict=True):
             pairs[i] = rotate(point[i], jnp.clip(x, -LONGEST_STEP, LONGEST_STEP))
-        trial = better_copy(scene, _project(scene, Point(*pairs)))
+        trial = best(_project(scene, Point(*pairs)))
         new = evaluate(scene, data, trial)[0] / data.one
         accept = (new >= value - rounding) & ~done
         damping = jnp.where(accept, 0.1 * damping, jnp.maximum(10 * damping, 1e-2))
         damping = jnp.where(damping < 1e-3, 0.0, damping)
         point = jax.tree.map(partial(jnp.where, accept), trial, point)
-        return count + 1, point, jnp.where(accept, new, value), damping, done | ~jnp.isfinite(value)
+        # the last step is taken, too: it is paid for, and leaves far less to gain than was asked for
+        return count + 1, point, jnp.where(accept, new, value), damping, done | arrived | ~jnp.isfinite(value)
 
     def unfinished(carry: Any) -> Any:
         return (carry[0] < iterations) & ~jnp.all(carry[4])
 
-    point = better_copy(scene, point)
+    point = best(point)
     value, at = evaluate(scene, data, point)
     # the residual is rounded like eps times the signal-to-noise ratio, and is squared
     rounding = 10 * eps * (1 + data.strength) * jnp.sqrt(1 + at.square) / data.one

@@ -75,7 +75,9 @@ def _diattenuation(out: np.ndarray, frozen: np.ndarray) -> None:
     covariance = _covariance(out, index)
     delta = np.where(held, 0.5 * np.pi, np.arcsin(np.minimum(value[index], 1)))
     cosine = np.maximum(np.cos(delta), 1e-30)
-    width = np.where(held, 2 * np.sqrt(covariance[0, 0]), std[index] / cosine)
+    # where the density bends up from the bound (other angles are undetermined there) its slope alone counts
+    along = np.where(covariance[0, 0] > 0, 2 * np.sqrt(covariance[0, 0]), np.inf)
+    width = np.where(held, along, std[index] / cosine)
     slope = 0.5 * out[ROWS["slope_0"], index].astype(float)
     reach = np.minimum(8 * width, 40 / np.maximum(slope, 1e-30))
     low = np.maximum(delta - reach, -0.5 * np.pi)
@@ -85,8 +87,8 @@ def _diattenuation(out: np.ndarray, frozen: np.ndarray) -> None:
     density = np.exp(-slope * np.abs(away) - 0.5 * (away / width) ** 2) * np.cos(x) * WEIGHTS[:, None]
     total = density.sum(axis=0)
     evidence = np.log(total * 0.5 * (high - low))
-    gaussian = np.log(np.sqrt(2 * np.pi) * width * cosine)
-    out[ROWS["log_evidence"], index] += np.where(held, evidence, evidence - gaussian)
+    gaussian = np.where(held, 0, np.log(np.sqrt(2 * np.pi) * width * cosine))
+    out[ROWS["log_evidence"], index] += evidence - gaussian
     if not held.any():
         return
     share = (density / total)[:, held]

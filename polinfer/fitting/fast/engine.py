@@ -16,8 +16,10 @@ import numpy as np
 from ...records import Parameters
 from ...statistics import Statistics
 from . import kernel
+from .climb import moved
 from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROWS, WIDE, rows
-from .priors import FACTORS
+from .point import Point
+from .priors import COPIES, FACTORS
 from .scene import Scene
 
 __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
@@ -45,7 +47,7 @@ class Responses:
         """Real type of the results."""
         return np.zeros((), jax.dtypes.canonicalize_dtype(self.response.dtype)).real.dtype
 
-    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: bool, iterations: int) -> tuple[Any, Any]:
+    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: int, iterations: int) -> tuple[Any, Any]:
         """Rows and flags of the pixels ``take``."""
         sigma = self.sigma if len(self.sigma) == 1 else self.sigma[take]
         return kernel.from_responses(
@@ -70,7 +72,7 @@ class Summed:
         """Real type of the results."""
         return np.zeros((), jax.dtypes.canonicalize_dtype(self.statistics.response.dtype)).real.dtype
 
-    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: bool, iterations: int) -> tuple[Any, Any]:
+    def run(self, scene: Scene, take: slice | np.ndarray, start: Any, given: int, iterations: int) -> tuple[Any, Any]:
         """Rows and flags of the pixels ``take``."""
         part = Statistics(*(x[take] for x in self.statistics))
         return kernel.from_statistics(scene, self.balanced, part, start, given, iterations, self.dtype.type(1))
@@ -106,7 +108,7 @@ def _each(work: Callable[[int], None], items: Iterable[int]) -> None:
 
 
 def _pass(
-    scene: Scene, frame: Frame, index: np.ndarray | None, start: np.ndarray | None, iterations: int,
+    scene: Scene, frame: Frame, index: np.ndarray | None, start: np.ndarray | None, given: int, iterations: int,
     out: np.ndarray, flags: np.ndarray, done: Callable[[int], Any],
 ) -> None:  # fmt: skip
     """Rows and flags of the pixels ``index`` (None: all), from a start or the closed form, into ``out``."""
@@ -125,7 +127,7 @@ def _pass(
         begun = nothing
         if start is not None:
             begun = jnp.asarray(start[:, _fill(np.arange(begin, end), size)])
-        found, bits = frame.run(scene, take, begun, start is not None, iterations)
+        found, bits = frame.run(scene, take, begun, given, iterations)
         out[:, begin:end] = np.asarray(found)[:, : end - begin]
         flags[begin:end] = np.asarray(bits)[: end - begin]
         done(end - begin)
@@ -161,17 +163,31 @@ def _alternatives(points: np.ndarray) -> list[np.ndarray]:
     ]
 
 
+def _copies(scene: Scene, points: np.ndarray) -> list[np.ndarray]:
+    """The equivalent points whose priors differ, from the points ``(10, pixels)``."""
+    pairs = Point(*points.reshape(5, 2, -1))
+    found: dict[Any, np.ndarray] = {}
+    for row, copy in zip(scene.copies, COPIES, strict=True):
+        prior = tuple(None if t is None else t.transformed(*m) for t, m in zip(scene.prior, copy, strict=True))
+        if row and prior not in found:
+            found[prior] = np.concatenate([np.stack(pair) for pair in moved(copy, pairs)])
+    return list(found.values())
+
+
 def solve_frame(
     scene: Scene, frame: Frame, earlier: Parameters | None, done: Callable[[int], Any]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rows of the result ``(rows, pixels)`` and the flags of every pixel, the best maximum found."""
     pixels = frame.pixels
     out, flags = np.empty((rows(scene), pixels), frame.dtype), np.empty(pixels, np.int32)
-    _pass(scene, frame, None, None, FIRST, out, flags, done)
+    _pass(scene, frame, None, None, kernel.CLOSED_FORM, FIRST, out, flags, done)
     again = partial(_again, scene, frame, out, flags)
     again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points])
     again((flags & (DOUBTFUL | WIDE | NON_FINITE)) == DOUBTFUL, lambda points, _: _alternatives(points)[:1])
     again((flags & (WIDE | NON_FINITE)) == WIDE, lambda points, _: _alternatives(points))
+    if len(scene.groups) > 2:  # priors that tell more than the two sides of the circularity apart
+        ambiguous = (flags & NON_FINITE == 0) & (flags & (DOUBTFUL | WIDE) != 0)
+        again(ambiguous, lambda points, _: _copies(scene, points), kernel.STAY)
     if earlier is not None:
         told = pairs_of(earlier, frame.dtype)
         finite = np.isfinite(told).all(axis=0)
@@ -181,7 +197,7 @@ def solve_frame(
 
 def _again(
     scene: Scene, frame: Frame, out: np.ndarray, flags: np.ndarray, which: np.ndarray,
-    starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]],
+    starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]], given: int = kernel.GIVEN,
 ) -> None:  # fmt: skip
     """Climb again from other starts, and keep what is better."""
     index = np.flatnonzero(which)
@@ -190,7 +206,7 @@ def _again(
     new, bits = np.empty((len(out), len(index)), out.dtype), np.empty(len(index), np.int32)
     points = pairs_of(Parameters(*out[ROWS["parameters"]][:, index]), frame.dtype)
     for begun in starts(points, index):
-        _pass(scene, frame, index, begun, MOST, new, bits, lambda _: None)
+        _pass(scene, frame, index, begun, given, MOST, new, bits, lambda _: None)
         value, old = new[ROWS["log_posterior"]], out[ROWS["log_posterior"], index]
         # what is better by rounding only is worth no change, unless it settles a pixel
         slack, rounding = (1e-9, 1e-6) if out.dtype == np.float64 else (1e-4, 0.05)

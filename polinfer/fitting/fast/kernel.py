@@ -17,7 +17,10 @@ from .point import Point
 from .scene import Scene
 from .start import closed_form
 
-__all__ = ["Shared", "from_responses", "from_statistics", "no_start"]
+__all__ = ["CLOSED_FORM", "GIVEN", "STAY", "Shared", "from_responses", "from_statistics", "no_start"]
+
+# where a climb starts: in the closed form, or in a point that is given; and whether it may change to another copy of it
+CLOSED_FORM, GIVEN, STAY = range(3)
 
 
 class Shared(NamedTuple):
@@ -45,8 +48,8 @@ def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, it
     told = Point(
         *((start[2 * i], start[2 * i + 1]) if known is None else closed[i] for i, known in enumerate(scene.fixed))
     )
-    point = jax.tree.map(partial(jnp.where, given), told, closed)
-    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations))
+    point = jax.tree.map(partial(jnp.where, given != CLOSED_FORM), told, closed)
+    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations, given != STAY))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -55,7 +58,7 @@ def from_statistics(
 ) -> tuple[Any, Any]:
     """Rows ``(rows, pixels)`` and flags of pixels with statistics of their own.
 
-    ``start`` (10, pixels) are (cosine, sine) of the five angles, used if ``given``; else the closed form is.
+    ``start`` (10, pixels) are (cosine, sine) of the five angles; ``given`` says how they are used.
     """
     data = prepare(
         balanced,

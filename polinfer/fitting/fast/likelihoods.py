@@ -115,7 +115,8 @@ class Phase:
         ratio = bessel_ratio(x)
         # 1 - A/x - A^2 cancels at large x, and A/x is 1/2 at 0
         over = jnp.where(x > 1e-3, ratio * inverse, 0.5)
-        bend = jnp.where(far, inverse * inverse * (0.5 + inverse * (0.25 + 0.375 * inverse)), 1 - over - ratio * ratio)
+        series = 0.5 + inverse * (0.25 + inverse * (0.375 + inverse * (0.78125 + inverse * 2.03125)))
+        bend = jnp.where(far, inverse * inverse * series, 1 - over - ratio * ratio)
         return Slopes(2 * ratio, -1.0, rr=4 * bend, across=4 * over)
 
     def mean_gain(self, at: Residual) -> Pair:
