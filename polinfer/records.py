@@ -189,7 +189,8 @@ class Fit:
     log_evidence: Laplace approximation, summed over all equivalent parameter sets (nats).
     sigma: noise used. gain: posterior mean of the complex gain at the maximum, None if the model has none.
     status: :class:`Status` bits. chi_square: ``2 |residual|^2 / sigma^2`` at the maximum, to be compared with
-    degrees_of_freedom: real data less fitted parameters and gain, at least 0.
+    degrees_of_freedom: real data less fitted parameters and gain, at least 0. Where sigma was inferred it is
+        that of :attr:`sigma`, and says little; widths are then those of Student's distribution (scope "pixel").
     started_from_fit: whether an earlier fit was given as start.
     """
 
