@@ -1,4 +1,4 @@
-"""What the conversions share: the sense of the vertical component, and elements described by their axes.
+"""What the conversions of parameters share: elements described by their axes.
 
 Other packages give a retarder by its retardance in [0, pi] and its fast axis, and a diattenuator by its transmissions
 and its transmitting axis, with axes along ``(cos a, sin a)``: an axis at angle t here is at ``a = -t`` there.
@@ -18,26 +18,14 @@ from ..records import Parameters
 __all__ = [
     "diattenuator_arguments",
     "diattenuator_parameters",
-    "flip",
     "half_turn",
+    "linear_retarder_arguments",
+    "linear_retarder_parameters",
     "real_arrays",
     "reduced",
-    "refuse_elliptical",
     "retarder_arguments",
     "retarder_parameters",
 ]
-
-_MIRROR = np.array([[1, -1], [-1, 1]], np.int8)
-
-
-def flip(matrices: np.ndarray, flip_vertical: bool) -> np.ndarray:
-    """``diag(1, -1) J diag(1, -1)`` if asked for: matrices ``(*P, 2, 2)`` whose component 1 points the other way.
-
-    >>> flip(np.ones((2, 2)), True).tolist()
-    [[1.0, -1.0], [-1.0, 1.0]]
-    """
-    # adding 0 makes -0 to 0: the phase of -1 - 0i is -pi, and packages read a handedness from that sign
-    return matrices * _MIRROR + 0 if flip_vertical else matrices + 0
 
 
 def half_turn(angle: np.ndarray) -> np.ndarray:
@@ -101,8 +89,18 @@ def retarder_parameters(retardance: Any, azimuth: Any, ellipticity: Any, flip_ve
     return canonicalise(Parameters(zero, zero, retardance, angle, np.arctan2(-circular, diagonal)))
 
 
-def refuse_elliptical(package: str, retardance: np.ndarray, ellipticity: np.ndarray) -> None:
-    """Raise ValueError unless every retarder is linear, as the only ones that ``package`` can build."""
+def linear_retarder_arguments(
+    package: str, parameters: Parameters, flip_vertical: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angle of the fast axis in [0, pi) and retardance in [0, pi], radians, for a package that knows no ellipse.
+
+    Raises ValueError unless every retarder is linear.
+
+    >>> parameters = Parameters(0.0, 0.0, 1.0, 0.3, 0.0)
+    >>> [round(float(x), 3) for x in linear_retarder_arguments("pypolar", parameters, False)]
+    [1.271, 1.0]
+    """
+    retardance, azimuth, ellipticity = retarder_arguments(parameters, flip_vertical)
     # what counts is how far the matrix is from that of a linear retarder: a plate without retardance has no axis
     circular = np.abs(np.sin(2 * ellipticity) * np.sin(retardance / 2))
     bad = circular > np.sqrt(np.finfo(circular.dtype).eps)
@@ -113,6 +111,17 @@ def refuse_elliptical(package: str, retardance: np.ndarray, ellipticity: np.ndar
             f"{np.count_nonzero(bad)} of {bad.size} elliptical, ellipticity up to {largest:.2g} rad; convert the "
             f"matrices with to_{package}, or fit with circularity fixed to 0."
         )
+    return azimuth, retardance
+
+
+def linear_retarder_parameters(flip_vertical: bool, **arguments: Any) -> Parameters:
+    """The reverse of linear_retarder_arguments: fast axis and retardance in this order, by the package's own names.
+
+    >>> [round(float(x), 3) for x in linear_retarder_parameters(False, theta=np.pi / 2 - 0.3, delta=1.0)[2:]]
+    [1.0, 0.3, 0.0]
+    """
+    azimuth, retardance = real_arrays(**arguments)
+    return retarder_parameters(retardance, azimuth, np.zeros_like(azimuth), flip_vertical)
 
 
 def diattenuator_arguments(parameters: Parameters, flip_vertical: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -127,14 +136,21 @@ def diattenuator_arguments(parameters: Parameters, flip_vertical: bool) -> tuple
     return 1 + np.abs(p.diattenuation), 1 - np.abs(p.diattenuation), half_turn(angle)
 
 
-def diattenuator_parameters(largest: np.ndarray, least: np.ndarray, azimuth: Any, flip_vertical: bool) -> Parameters:
+def diattenuator_parameters(axis: str, flip_vertical: bool, **arguments: Any) -> Parameters:
     """Canonical parameters (no retardance) of a diattenuator; NaN where it transmits nothing.
 
-    >>> [round(float(x), 3) for x in diattenuator_parameters(np.array(0.5), np.array(0.3), -0.3, False)]
+    The arguments are ``Tmax``, ``Tmin`` and the angle of the transmitting axis, which the package calls ``axis``.
+
+    >>> [round(float(x), 3) for x in diattenuator_parameters("a", False, Tmax=0.5, Tmin=0.3, a=-0.3)]
     [0.25, 0.3, 0.0, 1.571, 0.0]
     """
+    for name, value in arguments.items():
+        if name != axis:
+            real_array(name, value, low=0)
+    values = dict(zip(arguments, real_arrays(**arguments), strict=True))
+    largest, least, azimuth = values["Tmax"], values["Tmin"], values[axis]
     with np.errstate(invalid="ignore"):
         diattenuation = np.asarray((largest - least) / (largest + least))
-    angle = np.asarray(azimuth) if flip_vertical else -np.asarray(azimuth)
+    angle = azimuth if flip_vertical else -azimuth
     zero = np.zeros_like(diattenuation)
     return canonicalise(Parameters(diattenuation, angle, zero, zero, zero))

@@ -10,7 +10,8 @@ import numpy as np
 from ..checks import complex_array
 from ..degeneracy import canonicalise
 from ..records import Parameters
-from .axes import flip, half_turn, real_arrays, reduced
+from .axes import half_turn, real_arrays, reduced
+from .matrices import flip, jones_matrices
 
 __all__ = ["from_chromatix", "from_chromatix_retarder", "to_chromatix", "to_chromatix_retarder"]
 
@@ -41,7 +42,7 @@ def to_chromatix(jones: Any, *, flip_vertical: bool = False) -> np.ndarray:
     >>> to_chromatix([[1, 2], [3, 4]]).real.astype(int).tolist()
     [[0, 0, 0], [0, 4, 3], [0, 2, 1]]
     """
-    matrices = flip(complex_array("jones", jones, trailing=(2, 2)), flip_vertical)
+    matrices = jones_matrices("jones", jones, flip_vertical)
     result = np.zeros((*matrices.shape[:-2], 3, 3), matrices.dtype)
     result[..., 1:, 1:] = matrices[..., ::-1, ::-1]
     return result

@@ -6,17 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import complex_array, real_array, real_number
+from ..checks import real_array, real_number
 from ..records import Parameters
 from .axes import (
     diattenuator_arguments,
     diattenuator_parameters,
-    flip,
-    real_arrays,
-    refuse_elliptical,
-    retarder_arguments,
-    retarder_parameters,
+    linear_retarder_arguments,
+    linear_retarder_parameters,
 )
+from .matrices import flip, jones_matrices
 
 __all__ = [
     "from_katsu",
@@ -57,7 +55,7 @@ def to_katsu(jones: Any, *, flip_vertical: bool = False) -> np.ndarray:
     >>> to_katsu(np.diag([1, 1j])).round(3).tolist()  # fast axis horizontal, a quarter of a period
     [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]]
     """
-    matrices = flip(complex_array("jones", jones, trailing=(2, 2)), flip_vertical)
+    matrices = jones_matrices("jones", jones, flip_vertical)
     stokes = _STOKES.astype(matrices.dtype)
     with np.errstate(invalid="ignore"):
         product = matrices[..., :, None, :, None] * np.conj(matrices)[..., None, :, None, :]
@@ -163,8 +161,7 @@ def to_katsu_retarder(parameters: Parameters, *, flip_vertical: bool = False) ->
     >>> {name: round(float(x), 3) for name, x in arguments.items()}
     {'a': 1.271, 'r': 1.0}
     """
-    retardance, azimuth, ellipticity = retarder_arguments(parameters, flip_vertical)
-    refuse_elliptical("katsu", retardance, ellipticity)
+    azimuth, retardance = linear_retarder_arguments("katsu", parameters, flip_vertical)
     return {"a": azimuth, "r": retardance}
 
 
@@ -180,8 +177,7 @@ def from_katsu_retarder(a: Any, r: Any, *, flip_vertical: bool = False) -> Param
     >>> round(float(p.retardance), 3), round(float(p.retardance_angle), 3)
     (1.0, 0.3)
     """
-    a, r = real_arrays(a=a, r=r)
-    return retarder_parameters(r, a, np.zeros_like(a), flip_vertical)
+    return linear_retarder_parameters(flip_vertical, a=a, r=r)
 
 
 def to_katsu_diattenuator(parameters: Parameters, *, flip_vertical: bool = False) -> dict[str, np.ndarray]:
@@ -220,7 +216,4 @@ def from_katsu_diattenuator(a: Any, Tmin: Any, Tmax: Any = 1.0, *, flip_vertical
     >>> round(float(p.diattenuation), 3), round(float(p.diattenuation_angle), 3)
     (0.6, 0.3)
     """
-    real_array("Tmin", Tmin, low=0)
-    real_array("Tmax", Tmax, low=0)
-    a, Tmin, Tmax = real_arrays(a=a, Tmin=Tmin, Tmax=Tmax)
-    return diattenuator_parameters(Tmax, Tmin, a, flip_vertical)
+    return diattenuator_parameters("a", flip_vertical, a=a, Tmin=Tmin, Tmax=Tmax)

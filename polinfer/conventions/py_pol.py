@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import complex_array, real_array
+from ..checks import complex_array
 from ..records import Parameters
 from .axes import (
     diattenuator_arguments,
     diattenuator_parameters,
-    flip,
     real_arrays,
     retarder_arguments,
     retarder_parameters,
 )
+from .matrices import conjugate, flip, jones_matrices
 
 __all__ = [
     "from_py_pol",
@@ -56,8 +56,7 @@ def to_py_pol(jones: Any, *, flip_vertical: bool = False) -> np.ndarray:
     >>> to_py_pol(np.zeros((3, 4, 2, 2))).shape
     (2, 2, 3, 4)
     """
-    matrices = flip(complex_array("jones", jones, trailing=(2, 2)), flip_vertical)
-    return np.moveaxis(np.conj(matrices) + 0, (-2, -1), (0, 1))
+    return np.moveaxis(conjugate(jones_matrices("jones", jones, flip_vertical)), (-2, -1), (0, 1))
 
 
 def from_py_pol(matrix: Any, *, flip_vertical: bool = False) -> np.ndarray:
@@ -95,7 +94,7 @@ def from_py_pol(matrix: Any, *, flip_vertical: bool = False) -> np.ndarray:
             f"matrix must have shape (2, 2, ...) as in py_pol, got {array.shape}; move the axes of the matrix to the "
             "front with np.moveaxis(matrix, (-2, -1), (0, 1))."
         )
-    return np.conj(flip(np.moveaxis(array, (0, 1), (-2, -1)), flip_vertical)) + 0
+    return conjugate(flip(np.moveaxis(array, (0, 1), (-2, -1)), flip_vertical))
 
 
 def to_py_pol_object(jones: Any, *, name: str = "J", flip_vertical: bool = False) -> Any:
@@ -239,7 +238,4 @@ def from_py_pol_diattenuator(Tmax: Any, Tmin: Any, azimuth: Any, *, flip_vertica
     >>> round(float(p.diattenuation), 3), round(float(p.diattenuation_angle), 3)
     (0.2, 0.3)
     """
-    real_array("Tmax", Tmax, low=0)
-    real_array("Tmin", Tmin, low=0)
-    Tmax, Tmin, azimuth = real_arrays(Tmax=Tmax, Tmin=Tmin, azimuth=azimuth)
-    return diattenuator_parameters(Tmax, Tmin, azimuth, flip_vertical)
+    return diattenuator_parameters("azimuth", flip_vertical, Tmax=Tmax, Tmin=Tmin, azimuth=azimuth)

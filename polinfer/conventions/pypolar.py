@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import complex_array
 from ..records import Parameters
-from .axes import flip, real_arrays, refuse_elliptical, retarder_arguments, retarder_parameters
+from .axes import linear_retarder_arguments, linear_retarder_parameters
+from .matrices import conjugate, jones_matrices
 
 __all__ = ["from_pypolar", "from_pypolar_retarder", "to_pypolar", "to_pypolar_retarder"]
 
@@ -39,7 +39,7 @@ def to_pypolar(jones: Any, *, flip_vertical: bool = False) -> np.ndarray:
     >>> np.degrees(np.angle(np.diagonal(plate))).round().tolist()
     [-45.0, 45.0]
     """
-    return np.conj(flip(complex_array("jones", jones, trailing=(2, 2)), flip_vertical)) + 0
+    return conjugate(jones_matrices("jones", jones, flip_vertical))
 
 
 def from_pypolar(matrix: Any, *, flip_vertical: bool = False) -> np.ndarray:
@@ -68,7 +68,7 @@ def from_pypolar(matrix: Any, *, flip_vertical: bool = False) -> np.ndarray:
     >>> round(float(p.retardance), 3), round(float(p.retardance_angle), 3)  # the vertical axis is slow
     (1.571, 1.571)
     """
-    return np.conj(flip(complex_array("matrix", matrix, trailing=(2, 2)), flip_vertical)) + 0
+    return conjugate(jones_matrices("matrix", matrix, flip_vertical))
 
 
 def to_pypolar_retarder(parameters: Parameters, *, flip_vertical: bool = False) -> dict[str, np.ndarray]:
@@ -94,8 +94,7 @@ def to_pypolar_retarder(parameters: Parameters, *, flip_vertical: bool = False) 
     >>> {name: round(float(x), 3) for name, x in arguments.items()}
     {'theta': 1.271, 'delta': 1.0}
     """
-    retardance, azimuth, ellipticity = retarder_arguments(parameters, flip_vertical)
-    refuse_elliptical("pypolar", retardance, ellipticity)
+    azimuth, retardance = linear_retarder_arguments("pypolar", parameters, flip_vertical)
     return {"theta": azimuth, "delta": retardance}
 
 
@@ -111,5 +110,4 @@ def from_pypolar_retarder(theta: Any, delta: Any, *, flip_vertical: bool = False
     >>> round(float(p.retardance), 3), round(float(p.retardance_angle), 3)
     (1.0, 0.3)
     """
-    theta, delta = real_arrays(theta=theta, delta=delta)
-    return retarder_parameters(delta, theta, np.zeros_like(theta), flip_vertical)
+    return linear_retarder_parameters(flip_vertical, theta=theta, delta=delta)
