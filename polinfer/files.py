@@ -15,11 +15,16 @@ from .orderings import PolariserFirst, RetarderFirst
 from .phantoms import Phantom
 from .priors import AxialVonMises, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters
+from .sampling.diagnostics import Diagnostics
+from .sampling.draws import Draws
+from .sampling.predictive import Predictive
+from .sampling.summaries import Summary
 
 __all__ = ["TYPES", "load"]
 
 TYPES: tuple[type, ...] = (
     Measurement, Fit, Phantom, FibreMatrix, Parameters, Model,
+    Draws, Summary, Diagnostics, Predictive,
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
     KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
-__all__ = ["colour_circle", "plot_fit"]
+    from .sampling.summaries import Summary
+
+__all__ = ["colour_circle", "plot_fit", "plot_summary"]
 
 TITLES = Parameters(
     "diattenuation", "diattenuation angle (°)", "retardance (°)", "retardance angle (°)", "circularity (°)"
@@ -128,6 +130,48 @@ def _draw(
         _scale_bar(axes, image.shape[1], pixel_size)
 
 
+def _figure(status: np.ndarray, columns: int, pixel_size: float | None) -> tuple[Figure, np.ndarray]:
+    """A figure with two rows of maps, as high as the pixels ask for."""
+    from matplotlib.figure import Figure
+
+    high, wide = _image(status).shape
+    height = min(max(2.2 * high / wide, 0.7), 3.0)
+    figure = Figure(figsize=(2.9 * columns, 2 * (height + (0.5 if pixel_size is None else 0.7)) + 0.2),
+                    layout="constrained")  # fmt: skip
+    return figure, figure.subplots(2, columns, squeeze=False)
+
+
+def _draw_parameters(
+    axes: np.ndarray, parameters: Parameters, std: Parameters, status: np.ndarray, pixel_size: float | None
+) -> bool:
+    """Maps of the five parameters above their standard deviations; whether any pixel is grey."""
+    lost, grey = (status & _NO_ANSWER) != 0, False
+    for i, name in enumerate(Parameters._fields):
+        unit = 1.0 if name == "diattenuation" else 180 / np.pi
+        value, width = unit * np.asarray(getattr(parameters, name)), unit * np.asarray(getattr(std, name))
+        unknown = ~lost & ((status & int(Status.unidentified(name))) != 0)
+        grey = grey or bool(np.any(unknown))
+        period = None if name == "diattenuation" else unit * getattr(PERIODS, name)
+        _draw(axes[0, i], getattr(TITLES, name), value, lost, period, unknown=unknown, pixel_size=pixel_size)
+        # a width beyond that of a uniform distribution says no more than "unknown" and would hide all others
+        ceiling = (2 if period is None else period) / 12**0.5
+        title = "± standard deviation" if period is None else "± standard deviation (°)"
+        dropped = ~lost & np.isnan(width)
+        _draw(axes[1, i], title, width, lost, high=ceiling, unknown=dropped, pixel_size=pixel_size)
+    return grey
+
+
+def _explain(figure: Figure, grey: bool, hatched: bool, smooth: bool) -> None:
+    """What grey and hatched pixels mean, and which gauge it is."""
+    from matplotlib.patches import Patch
+
+    handles = [Patch(facecolor=_GREY, label="not identified")] if grey else []
+    handles += [Patch(**_HATCHED, linewidth=0, label="no answer")] if hatched else []
+    handles += [Patch(alpha=0, label="smooth gauge")] if smooth else []
+    if handles:
+        figure.legend(handles=handles, loc="outside lower right", ncols=3, fontsize=8, frameon=False, borderpad=0)
+
+
 def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) -> Figure:
     """Maps of a fit: each parameter above its standard deviation, beside reduced chi-square and evidence.
 
@@ -155,20 +199,13 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
     >>> [axes.get_title() for axes in figure.axes][:2]
     ['χ² / degrees of freedom', 'diattenuation']
     """
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
     one_of_types("fit", fit, (Fit,), "pass the result of fit().")
     if pixel_size is not None:
         pixel_size = real_number("pixel_size", pixel_size, above=0)
     status = np.asarray(fit.status)
     lost = (status & _NO_ANSWER) != 0
-    rows, columns = _image(status).shape
-    height = min(max(2.2 * rows / columns, 0.7), 3.0)
     extra = 1 if fit.gain is None else 2
-    figure = Figure(figsize=(2.9 * (5 + extra), 2 * (height + (0.5 if pixel_size is None else 0.7)) + 0.2),
-                    layout="constrained")  # fmt: skip
-    axes = figure.subplots(2, 5 + extra, squeeze=False)
+    figure, axes = _figure(status, 5 + extra, pixel_size)
     quality = axes[1] if fit.gain is not None else axes[:, 0]
     if fit.gain is not None:
         _draw(axes[0, 0], "amplitude", np.abs(fit.gain), lost, pixel_size=pixel_size)
@@ -178,22 +215,48 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
           high=np.inf, pixel_size=pixel_size)  # fmt: skip
     _draw(quality[1], "log evidence (nat)", fit.log_evidence, lost, pixel_size=pixel_size)
     parameters = smooth_gauge(fit.parameters, status) if smooth else fit.parameters
-    grey = False
-    for i, name in enumerate(Parameters._fields):
-        unit = 1.0 if name == "diattenuation" else 180 / np.pi
-        value, std = unit * np.asarray(getattr(parameters, name)), unit * np.asarray(getattr(fit.std, name))
-        unknown = ~lost & ((status & int(Status.unidentified(name))) != 0)
-        grey = grey or bool(np.any(unknown))
-        period = None if name == "diattenuation" else unit * getattr(PERIODS, name)
-        _draw(axes[0, extra + i], getattr(TITLES, name), value, lost, period, unknown=unknown, pixel_size=pixel_size)
-        # a width beyond that of a uniform distribution says no more than "unknown" and would hide all others
-        ceiling = (2 if period is None else period) / 12**0.5
-        title = "± standard deviation" if period is None else "± standard deviation (°)"
-        dropped = ~lost & np.isnan(std)
-        _draw(axes[1, extra + i], title, std, lost, high=ceiling, unknown=dropped, pixel_size=pixel_size)
-    handles = [Patch(facecolor=_GREY, label="not identified")] if grey else []
-    handles += [Patch(**_HATCHED, linewidth=0, label="no answer")] if lost.any() else []
-    handles += [Patch(alpha=0, label="smooth gauge")] if smooth else []
-    if handles:
-        figure.legend(handles=handles, loc="outside lower right", ncols=3, fontsize=8, frameon=False, borderpad=0)
+    grey = _draw_parameters(axes[:, extra:], parameters, fit.std, status, pixel_size)
+    _explain(figure, grey, bool(lost.any()), smooth)
+    return figure
+
+
+def plot_summary(summary: Summary, smooth: bool = False, pixel_size: float | None = None) -> Figure:
+    """Maps of full posteriors: the mean of each parameter above its standard deviation, beside those of the chains.
+
+    As :func:`plot_fit`, with mean directions and circular standard deviations. The first column is how well the chains
+    agree: how far the largest split R-hat is above 1, where it would be if they did, and the smallest number of
+    effective draws of the pixel.
+
+    Parameters
+    ----------
+    summary: of any pixel shape. smooth, pixel_size: see :func:`plot_fit`.
+
+    Raises
+    ------
+    TypeError, ValueError: not a summary, a pixel size out of range.
+
+    >>> import polinfer
+    >>> from polinfer.sampling.summaries import summarise_draws
+    >>> draws = Parameters(*np.random.default_rng(0).normal(0.5, 0.1, (5, 2, 50, 3, 4)))
+    >>> summary = summarise_draws(polinfer.Model(), draws, None, None, np.zeros((3, 4), int), level=0.68)
+    >>> [axes.get_title() for axes in plot_summary(summary).axes][:2]
+    ['largest R-hat − 1', 'diattenuation']
+    """
+    from .sampling.summaries import Summary
+
+    one_of_types("summary", summary, (Summary,), "pass the result of Draws.summary().")
+    if pixel_size is not None:
+        pixel_size = real_number("pixel_size", pixel_size, above=0)
+    status = np.asarray(summary.status)
+    lost = (status & _NO_ANSWER) != 0
+    figure, axes = _figure(status, 6, pixel_size)
+    # how the chains fare is shown where it is bad, too
+    none = np.isnan(summary.ess)
+    # infinite where no chain has moved
+    excess = np.minimum(summary.r_hat - 1, 10.0)
+    _draw(axes[0, 0], "largest R-hat − 1", excess, none, high=np.inf, pixel_size=pixel_size)
+    _draw(axes[1, 0], "fewest effective draws", summary.ess, none, high=np.inf, pixel_size=pixel_size)
+    parameters = smooth_gauge(summary.mean, status) if smooth else summary.mean
+    grey = _draw_parameters(axes[:, 1:], parameters, summary.std, status, pixel_size)
+    _explain(figure, grey, bool(lost.any()), smooth)
     return figure
