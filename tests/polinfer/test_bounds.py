@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
-from polinfer import ComplexGain, Model, Parameters, PhaseGain, PolariserFirst, RetarderFirst, cramer_rao_bound
+from polinfer import ComplexGain, Model, Parameters, PhaseGain, RetarderFirst, cramer_rao_bound
 from tests.oracles import jones as oracle
+from tests.polinfer.scenes import BALANCED, ORDERINGS, UNBALANCED
 
-BALANCED = np.array([[1, 1, 1], np.exp(2j * np.pi * np.arange(3) / 3)]) / 2**0.5
-UNBALANCED = np.array([[1, 0.9, 0.7], [0.1, 0.5j, 0.4 - 0.3j]])
 ONE_STATE = UNBALANCED[:, 1:2]
 GAINS = {"none": None, "phase": PhaseGain(), "complex": ComplexGain(1.0)}
-ORDERINGS = {"retarder_first": RetarderFirst(), "polariser_first": PolariserFirst()}
 EVERYWHERE = (0.3, 0.4, 1.3, 0.6, 0.3)
 
 

@@ -1,7 +1,5 @@
 """The fast route of ``fit`` finds what the general route finds, and what brute force says."""
 
-from dataclasses import dataclass, replace
-from functools import cache
 from math import pi
 
 import jax
@@ -17,11 +15,9 @@ from polinfer import (
     InferredNoise,
     Measurement,
     Model,
-    Ordering,
     Parameters,
     PhaseGain,
     PolariserFirst,
-    Prior,
     Status,
     TruncatedNormal,
     UniformAngle,
@@ -30,74 +26,22 @@ from polinfer import (
     fit,
     simulate,
 )
-from polinfer.elements import multiply, polariser, retarder
-from polinfer.fitting import frames
 from polinfer.fitting.fast import fast_scene
-
-BALANCED = np.array([[1, 1, 1], np.exp(2j * np.pi * np.arange(3) / 3)]) / 2**0.5
-UNBALANCED = np.array([[1, 0.9, 0.7], [0.1, 0.5j, 0.4 - 0.3j]])
-PRIORS = {
-    "diattenuation": TruncatedNormal(0.3, 0.4, -1.0, 1.0),
-    "diattenuation_angle": AxialVonMises(0.4, 1.5),
-    "retardance": VonMises(1.1, 0.7),
-    "retardance_angle": AxialVonMises(-0.9, 0.8),
-    "circularity": VonMises(0.5, 2.0),
-}
-FREE = Model()
-
-
-def with_priors(**fixed):
-    """All priors that are not the default ones, as far as the parameters are free."""
-    free = Model(fixed=fixed).free
-    return {"priors": {name: prior for name, prior in PRIORS.items() if name in free}, "fixed": fixed}
-
-
-# pairs of ordering, gain, priors, fixed values and balance of the states
-CASES = {
-    "free": (FREE, BALANCED),
-    "skew states": (Model(PolariserFirst(), gain=ComplexGain(0.8)), UNBALANCED),
-    "pure retarder": (Model(PolariserFirst(), **with_priors(diattenuation=0.0)), BALANCED),
-    "pure polariser": (Model(gain=ComplexGain(0.8), **with_priors(retardance=0.0)), UNBALANCED),
-    "known polariser": (Model(gain=PhaseGain(), **with_priors(diattenuation=0.4)), BALANCED),
-}
-
-
-@dataclass(frozen=True)
-class Same(Prior):
-    """A prior of a user's own that has the density of another one."""
-
-    other: Prior
-
-    def log_density(self, x):
-        return self.other.log_density(x)
-
-    def sample(self, rng, shape):
-        return self.other.sample(rng, shape)
-
-    @property
-    def support(self):
-        return self.other.support
-
-
-def general(model):
-    """The same densities by the general route."""
-    name = model.free[-1]
-    return replace(model, priors=dict(model.priors) | {name: Same(model.priors[name])})
-
-
-def drawn(model, count, rng):
-    values = {name: prior.sample(rng, (count,)) for name, prior in model.priors.items()}
-    values |= {name: np.full(count, value) for name, value in model.fixed.items()}
-    return Parameters(**values)
-
-
-@cache
-def pair(name):
-    """64 pixels with truths from the prior at two noise levels, by both routes."""
-    model, states = CASES[name]
-    rng = np.random.default_rng(17)
-    data = simulate(model, drawn(model, 64, rng), states, np.where(np.arange(64) % 2, 0.02, 0.2), rng=rng)
-    return model, data, fit(model, data), fit(general(model), data)
+from tests.polinfer.scenes import (
+    BALANCED,
+    CASES,
+    FREE,
+    PRIORS,
+    UNBALANCED,
+    Same,
+    Sandwich,
+    case,
+    drawn,
+    everywhere,
+    fitted,
+    general,
+    with_priors,
+)
 
 
 def gaussian(result, widest):
@@ -113,7 +57,8 @@ SLOW = ("pure polariser", "known polariser")  # to compile
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
 )
 def test_both_routes_find_the_same_maximum_and_describe_it_alike(name):
-    model, data, fast, slow = pair(name)
+    model, data = case(name)
+    fast, slow = fitted(name), fit(general(model), data)
     assert fast_scene(model) is not None
     assert fast_scene(general(model)) is None
     assert (fast.log_posterior >= slow.log_posterior - 1e-6).all()
@@ -178,7 +123,7 @@ def sampled_evidence(result, data, pixels, draws=4000):
 
 @pytest.mark.parametrize("name", ["free", "skew states"])
 def test_the_evidence_is_that_of_importance_sampling_where_the_density_is_a_gaussian(name):
-    _, data, fast, _ = pair(name)
+    (_, data), fast = case(name), fitted(name)
     pixels = np.flatnonzero(gaussian(fast, 0.12))[:12]
     assert len(pixels) >= 8
     expected = sampled_evidence(fast, data, pixels)
@@ -239,133 +184,6 @@ def test_at_and_near_bounds_the_evidence_is_that_of_importance_sampling_and_of_t
         np.testing.assert_allclose(ours, theirs, rtol=0.01)
 
 
-@dataclass(frozen=True)
-class Sandwich(Ordering):
-    """Half the retarder on either side of the polariser."""
-
-    def jones(self, parameters):
-        p = parameters
-        half = retarder(p.retardance / 2, p.retardance_angle, p.circularity)
-        return multiply(half, multiply(polariser(p.diattenuation, p.diattenuation_angle), half))
-
-
-@pytest.mark.parametrize(
-    ("model", "fast"),
-    [
-        (FREE, True),
-        (Model(PolariserFirst(), gain=PhaseGain(), priors=PRIORS), True),
-        (Model(gain=ComplexGain(2.0), priors={"diattenuation": UniformAngle(2.0)}), True),
-        (Model(neighbours=Window(3, 3)), True),
-        (Model(noise=InferredNoise(2.0, 0.1, "frame")), True),
-        (Model(noise=InferredNoise(2.0, 0.1, "pixel")), False),
-        (Model(gain=PhaseGain(), neighbours=Window(3, 3)), False),
-        (Model(Sandwich()), False),
-        (Model(priors={"circularity": Same(VonMises(0.0, 1.0))}), False),
-        (Model(priors={"circularity": UniformAngle(1.0)}), False),
-        (Model(priors={"retardance": TruncatedNormal(0.0, 1.0, -pi, pi)}), False),
-        (Model(priors={"diattenuation": TruncatedNormal(0.0, 0.5, -0.9, 1.0)}), False),
-        (Model(gain=PhaseGain(), priors={"retardance": AxialVonMises(0.0, 1.0)}), False),
-    ],
-)
-def test_what_is_shipped_goes_the_fast_route_and_what_is_not_the_general_one(model, fast):
-    assert (fast_scene(model) is not None) == fast
-
-
-def frame(shape, seed=1, sigma=0.05, states=BALANCED, **more):
-    rng = np.random.default_rng(seed)
-    truth = drawn(FREE, int(np.prod(shape)), rng)
-    truth = Parameters(*(x.reshape(shape) for x in truth))
-    return simulate(FREE, truth, states, sigma, rng=rng, **more)
-
-
-def assert_equal(one, other, where=..., there=..., atol=0.0):
-    """Two fits agree in every array, NaN included; ``atol`` in every unit."""
-    for group in ("parameters", "std"):
-        for name in Parameters._fields:
-            ours, theirs = getattr(getattr(one, group), name)[where], getattr(getattr(other, group), name)[there]
-            np.testing.assert_allclose(ours, theirs, rtol=0, atol=atol, err_msg=f"{group}.{name}")
-    for name in ("covariance", "log_posterior", "log_evidence", "chi_square", "sigma"):
-        ours, theirs = getattr(one, name)[where], getattr(other, name)[there]
-        np.testing.assert_allclose(ours, theirs, rtol=atol, atol=atol, err_msg=name)
-    np.testing.assert_array_equal(one.status[where], other.status[there])
-    np.testing.assert_array_equal(one.degrees_of_freedom[where], other.degrees_of_freedom[there])
-
-
-def refuse(*args, **more):
-    raise AssertionError("the general route was taken")
-
-
-def test_no_pixel_of_a_clean_frame_of_a_shipped_model_takes_the_general_route(monkeypatch):
-    monkeypatch.setattr(frames, "_fit_general", refuse)
-    result = fit(FREE, frame((8, 8)))
-    assert (result.status & int(Status.NOT_CONVERGED) == 0).all()
-    with pytest.raises(AssertionError, match="general route"):
-        fit(general(FREE), frame((8, 8)))
-
-
-@pytest.mark.parametrize("shape", [(), (1,), (1, 1), (1, 7), (2, 1, 3)])
-def test_a_pixel_does_not_depend_on_the_frame_that_it_is_in(shape):
-    response, some = frame((12,)).response, int(np.prod(shape))
-    part = fit(FREE, Measurement(BALANCED, response[:some].reshape(*shape, 2, 3), 0.05))
-    whole = fit(FREE, Measurement(BALANCED, response, 0.05))
-    assert part.status.shape == part.std.retardance.shape == shape
-    assert part.covariance.shape == (*shape, 5, 5)
-    assert_equal(part, whole, ..., np.arange(some).reshape(shape), 1e-12)
-
-
-def test_more_pixels_than_a_block_are_fitted_as_block_by_block():
-    data = frame((5000,), sigma=0.2)
-    whole = fit(FREE, data)
-    for begin in (0, 1000, 3900, 4100):
-        part = slice(begin, begin + 900)
-        # a few pixels at a time and many are compiled code of their own, which may round otherwise
-        assert_equal(fit(FREE, Measurement(BALANCED, data.response[part], 0.2)), whole, np.s_[...], part, 1e-6)
-
-
-def test_masked_and_nan_pixels_are_nan_and_leave_the_others_alone():
-    clean = frame((6, 7))
-    response, mask = clean.response.copy(), np.ones((6, 7), bool)
-    response[1, 2, 0, 1] = np.nan
-    response[4, 4, 1, 0] = np.inf
-    mask[0, :3] = False
-    response[0, 1] = np.nan
-    result, expected = fit(FREE, Measurement(BALANCED, response, clean.sigma, mask=mask)), fit(FREE, clean)
-    lost = ~mask
-    lost[1, 2] = lost[4, 4] = True
-    assert (result.status[~mask] == Status.MASKED).all()
-    assert result.status[1, 2] == result.status[4, 4] == Status.NON_FINITE
-    for values in (*result.parameters, *result.std, result.covariance, result.log_posterior, result.log_evidence,
-                   result.chi_square):  # fmt: skip
-        assert np.isnan(values[lost]).all()
-    assert_equal(result, expected, ~lost, ~lost, 1e-12)
-
-
-def test_a_nan_in_a_state_of_weight_0_is_no_loss():
-    model, data, _, _ = pair("skew states")
-    response, weight = data.response.copy(), np.array([1.0, 0.0, 1.0])
-    response[2, 0, 1] = response[3, 1, 1] = np.nan
-    response[5, 0, 2] = np.nan
-    result = fit(model, Measurement(UNBALANCED, response, data.sigma, weight=weight))
-    assert np.flatnonzero(result.status & int(Status.NON_FINITE)).tolist() == [5]
-    others = np.delete(np.arange(64), 5)
-    expected = fit(model, Measurement(UNBALANCED, data.response, data.sigma, weight=weight))
-    assert_equal(result, expected, others, others, 1e-12)
-
-
-def test_responses_that_overflow_are_never_ok_and_nan():
-    data = frame((12,))
-    response = data.response.copy()
-    response[2:6] *= np.array([1e20, 1e150, 1e200, 1e307])[:, None, None]
-    with np.errstate(all="ignore"):
-        result = fit(FREE, Measurement(BALANCED, response, data.sigma))
-    for values in (*result.parameters, *result.std, result.log_posterior, result.log_evidence, result.chi_square):
-        told = result.status & int(Status.NOT_CONVERGED | Status.NON_FINITE | Status.BAD_FIT) != 0
-        assert (np.isfinite(values) | told).all()
-    assert (result.status[2:6] != 0).all()
-    others = np.delete(np.arange(12), range(2, 6))
-    assert_equal(result, fit(FREE, data), others, others, 1e-12)
-
-
 def test_every_pixel_may_have_its_own_illumination_weight_and_sigma():
     rng = np.random.default_rng(3)
     truth = drawn(FREE, 64, rng)
@@ -397,7 +215,7 @@ def test_every_pixel_may_have_its_own_illumination_weight_and_sigma():
 def test_a_window_is_the_joint_fit_of_its_pixels():
     truth = Parameters(0.3, 0.4, 1.3, 0.6, 0.2)
     shape = (4, 5)
-    data = simulate(FREE, Parameters(*(np.full(shape, x) for x in truth)), BALANCED, 0.2, rng=2)
+    data = simulate(FREE, everywhere(shape, truth), BALANCED, 0.2, rng=2)
     mask = np.ones(shape, bool)
     mask[1, 1] = False
     result = fit(Model(neighbours=Window(3, 3)), Measurement(BALANCED, data.response, 0.2, mask=mask))
@@ -414,39 +232,23 @@ def test_a_window_is_the_joint_fit_of_its_pixels():
         np.testing.assert_allclose(result.covariance[y, x], expected.covariance, atol=1e-6)
 
 
-def test_identical_pixels_have_identical_fits():
-    one = frame((), seed=7)
-    many = fit(FREE, Measurement(BALANCED, np.broadcast_to(one.response, (70, 2, 3)).copy(), one.sigma))
-    for values in (*many.parameters, *many.std, many.log_posterior, many.log_evidence, many.status):
-        assert (values == values[0]).all()
-    assert_equal(many, fit(FREE, one), 0, ..., 1e-12)
-
-
-def test_an_earlier_fit_never_makes_the_answer_worse():
-    data = frame((40,), sigma=0.3)
-    cold = fit(FREE, data)
-    wrong = fit(FREE, frame((40,), seed=99, sigma=0.3))
-    for start in (cold, wrong):
-        warm = fit(FREE, data, start=start)
-        assert warm.started_from_fit
-        assert not cold.started_from_fit
-        assert_equal(warm, cold, ..., ..., 1e-6)
-
-
-def test_single_precision_stays_single_and_agrees_with_double():
-    model, double, high, _ = pair("skew states")
-    single = Measurement(UNBALANCED.astype(np.complex64), double.response.astype(np.complex64),
-                         double.sigma.astype(np.float32))  # fmt: skip
-    low = fit(model, single)
-    arrays = (*low.parameters, *low.std, low.covariance, low.log_posterior, low.log_evidence, low.chi_square, low.sigma)
-    assert all(x.dtype == np.float32 for x in arrays)
-    assert low.gain.dtype == np.complex64
-    assert (low.status & int(Status.NOT_CONVERGED) == 0).all()
-    sure = (high.status == 0) & (low.status == 0)
-    assert sure.mean() > 0.5
-    seen = [f.gain[:, None, None] * np.asarray(model.jones(f.parameters)) for f in (low, high)]
-    assert (np.abs(seen[0] - seen[1]).max(axis=(-1, -2)) / double.sigma)[sure].max() < 0.02
-    np.testing.assert_allclose(low.log_posterior, high.log_posterior, atol=2e-3)
-    for name in Parameters._fields:
-        np.testing.assert_allclose(getattr(low.std, name)[sure], getattr(high.std, name)[sure], rtol=0.03)
-    np.testing.assert_allclose(low.log_evidence[sure], high.log_evidence[sure], atol=0.05)
+@pytest.mark.parametrize(
+    ("model", "fast"),
+    [
+        (FREE, True),
+        (Model(PolariserFirst(), gain=PhaseGain(), priors=PRIORS), True),
+        (Model(gain=ComplexGain(2.0), priors={"diattenuation": UniformAngle(2.0)}), True),
+        (Model(neighbours=Window(3, 3)), True),
+        (Model(noise=InferredNoise(2.0, 0.1, "frame")), True),
+        (Model(noise=InferredNoise(2.0, 0.1, "pixel")), False),
+        (Model(gain=PhaseGain(), neighbours=Window(3, 3)), False),
+        (Model(Sandwich()), False),
+        (Model(priors={"circularity": Same(VonMises(0.0, 1.0))}), False),
+        (Model(priors={"circularity": UniformAngle(1.0)}), False),
+        (Model(priors={"retardance": TruncatedNormal(0.0, 1.0, -pi, pi)}), False),
+        (Model(priors={"diattenuation": TruncatedNormal(0.0, 0.5, -0.9, 1.0)}), False),
+        (Model(gain=PhaseGain(), priors={"retardance": AxialVonMises(0.0, 1.0)}), False),
+    ],
+)
+def test_what_is_shipped_goes_the_fast_route_and_what_is_not_the_general_one(model, fast):
+    assert (fast_scene(model) is not None) == fast

@@ -20,6 +20,7 @@ from polinfer import (
     phantoms,
 )
 from polinfer.priors import Prior
+from tests.polinfer.scenes import BALANCED, GAINS, X, everywhere
 
 
 def same(a, b):
@@ -46,9 +47,18 @@ def measurement(dtype=np.complex128):
     return Measurement(np.ones((2, 3), dtype), response, np.array(0.3), generator.uniform(size=(4, 3)), mask, seed=5)
 
 
-def fitted(model):
-    data = measurement()
-    return polinfer.fit(model, data if isinstance(model.noise, KnownNoise) else replace(data, sigma=None))
+def fitted(model, told=None):
+    """The fit of a frame with a broken and a masked pixel, ``told`` as that of another model if there is one.
+
+    What is stored does not depend on which model was fitted, and code is compiled for each.
+    """
+    data = polinfer.simulate(replace(model, noise=KnownNoise()), everywhere((3, 4), X), BALANCED, 0.05, rng=1)
+    response, mask = data.response.copy(), np.ones((3, 4), bool)
+    response[0, 0, 0, 0] = np.nan
+    mask[1, 1] = False
+    sigma = data.sigma if isinstance(model.noise, KnownNoise) else None
+    found = polinfer.fit(model, Measurement(BALANCED, response, sigma, mask=mask))
+    return found if told is None else replace(found, model=told)
 
 
 RECORDS = {
@@ -56,8 +66,10 @@ RECORDS = {
     "single precision": lambda: measurement(np.complex64),
     "unknown sigma": lambda: Measurement(np.eye(2), np.eye(2)),
     "phantom": lambda: phantoms.lesion((3, 4), rng=1),
-    "fit": lambda: fitted(Model(gain=ComplexGain(2.0), priors={"circularity": VonMises(0.5, 2.0)})),
-    "fit, fixed": lambda: fitted(Model(PolariserFirst(), gain=PhaseGain(), fixed={"diattenuation": 0.0},
+    "fit": lambda: fitted(Model(gain=GAINS["complex"]),
+                          Model(gain=ComplexGain(2.0), priors={"circularity": VonMises(0.5, 2.0)})),
+    "fit, fixed": lambda: fitted(Model(gain=GAINS["complex"], fixed={"diattenuation": 0.0}),
+                                 Model(PolariserFirst(), gain=PhaseGain(), fixed={"diattenuation": 0.0},
                                        priors={"retardance": UniformAngle(2 * np.pi)})),
     "fit, unknown noise": lambda: fitted(Model(noise=InferredNoise(2.0, 0.1, "frame"), neighbours=Window(1, 3))),
 }  # fmt: skip
@@ -88,7 +100,7 @@ class Flat(Prior):
 
 
 def test_types_of_ones_own_are_loaded_only_when_offered(tmp_path):
-    record = fitted(Model(priors={"diattenuation": Flat(1.0)}))
+    record = fitted(Model(), Model(priors={"diattenuation": Flat(1.0)}))
     path = polinfer.save(record, tmp_path / "fit.nc")
     same(polinfer.load(path, classes=(Flat,)), record)
     with pytest.raises(ValueError, match="holds a Flat, a type that was not offered"):

@@ -7,8 +7,7 @@ from scipy import integrate
 from polinfer import ComplexGain, KnownNoise, Measurement, Model, Parameters, PhaseGain, PolariserFirst, RetarderFirst
 from polinfer.statistics import least_squares_jones, summarise
 from tests.oracles import jones as oracle
-
-X = (0.3, 0.5, 1.2, 0.4, 0.7)
+from tests.polinfer.scenes import X
 
 
 def data(states, seed=0, sigma=0.2):

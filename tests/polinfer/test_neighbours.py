@@ -8,12 +8,10 @@ from hypothesis import strategies as st
 
 import polinfer
 from polinfer import (
-    ComplexGain,
     InferredNoise,
     Measurement,
     Model,
     Parameters,
-    PhaseGain,
     RetarderFirst,
     Status,
     Window,
@@ -23,10 +21,8 @@ from polinfer import (
 )
 from polinfer.neighbours import box_mean, box_sum
 from tests.oracles import jones as oracle
+from tests.polinfer.scenes import BALANCED, GAINS, X, everywhere
 
-X = (0.3, 0.5, 1.2, 0.4, 0.7)
-BALANCED = np.array([[1, 1, 1], np.exp(2j * np.pi * np.arange(3) / 3)]) / 2**0.5
-GAINS = {"none": None, "phase": PhaseGain(), "complex": ComplexGain(0.8)}
 NOISES = {"known": None, "pixel": InferredNoise(1.5, 0.06, "pixel")}
 
 
@@ -181,7 +177,7 @@ def test_sums_over_a_window_keep_the_digits_of_a_high_signal(gain, kind, noise):
 
 @pytest.mark.parametrize("gain", ["none", "complex"])
 def test_a_window_over_the_whole_frame_gives_every_pixel_the_same_fit_and_sharper_widths(gain):
-    truth = Parameters(*(np.full((3, 3), x) for x in (0.4, 0.5, 1.3, 0.6, 0.2)))
+    truth = everywhere((3, 3), (0.4, 0.5, 1.3, 0.6, 0.2))
     measurement = simulate(Model(gain=GAINS[gain]), truth, BALANCED, 0.05, rng=3)
     result = fit(Model(gain=GAINS[gain], neighbours=Window(5, 5)), measurement)
     alone = fit(Model(gain=GAINS[gain]), measurement)
@@ -225,7 +221,7 @@ def test_the_fit_of_a_window_is_a_maximum_of_the_windowed_density(gain, noise):
 
 
 def test_a_frame_of_unknown_noise_is_found_with_a_window():
-    truth = Parameters(*(np.full((8, 8), x) for x in (0.4, 0.5, 1.3, 0.6, 0.2)))
+    truth = everywhere((8, 8), (0.4, 0.5, 1.3, 0.6, 0.2))
     measurement = simulate(Model(), truth, BALANCED, 0.05, rng=3)
     model = Model(noise=InferredNoise(1e-3, 1e-9, "frame"), neighbours=Window(3, 3))
     result = fit(model, Measurement(BALANCED, measurement.response))
@@ -249,7 +245,7 @@ def test_float32_windows_agree_with_float64():
 
 def test_the_closed_form_of_a_window_is_that_of_the_mean_matrix():
     generator = np.random.default_rng(2)
-    truth = Parameters(*(np.full((5, 6), x) for x in (0.4, 0.5, 1.3, 0.6, 0.2)))
+    truth = everywhere((5, 6), (0.4, 0.5, 1.3, 0.6, 0.2))
     jones = np.asarray(RetarderFirst().jones(truth))
     noisy = jones + 0.05 * (generator.normal(size=jones.shape) + 1j * generator.normal(size=jones.shape))
     noisy[2, 3, 0, 1] = np.nan
