@@ -101,7 +101,7 @@ def _assess(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _geyer(correlation: np.ndarray) -> np.ndarray:
     """Autocorrelation time: sums of pairs, up to the first that is negative, none larger than the one before."""
-    length = correlation.shape[-1] // 2 * 2
+    length = max((correlation.shape[-1] - 1) // 2, 1) * 2
     even = correlation[..., 0:length:2]
     pairs = even + correlation[..., 1:length:2]
     negative = pairs < 0

@@ -44,7 +44,8 @@ def to_arviz(draws: Draws) -> Any:
     except ImportError as error:
         raise ImportError("to_arviz needs ArviZ, which is not installed: pip install 'polinfer[arviz]'.") from error
     groups = _groups(draws)
-    if hasattr(arviz, "InferenceData"):
+    # version 1 answers for the old name, too, with something else
+    if int(arviz.__version__.split(".")[0]) < 1:
         return arviz.InferenceData(**groups)
     import xarray
 
