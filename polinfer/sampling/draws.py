@@ -11,7 +11,7 @@ from .. import storage
 from ..checks import one_of_types
 from ..model import Model
 from ..records import Measurement, Parameters
-from ..storage import array
+from ..storage import array, setting
 from .diagnostics import LEAST, Diagnostics, diagnose
 from .summaries import Summary, summarise_draws
 
@@ -62,8 +62,8 @@ class Draws:
     status: np.ndarray = array(("*P",), "1")
     gain: np.ndarray | None = array(("chain", "draw", "*P"), "1")
     sigma: np.ndarray | None = array(("chain", "draw", "*P"), "1")
-    seed: int
-    sampler: Any
+    seed: int = setting()
+    sampler: Any = setting()
 
     def __post_init__(self) -> None:
         one_of_types("model", self.model, (Model,), "pass the Model of the draws.")
@@ -138,8 +138,8 @@ class Draws:
     ) -> Figure:
         """Maps of the means with their uncertainty below, or the joint posterior of one pixel.
 
-        ``pixel`` is an index into P, such as ``(row, column)``, see :func:`polinfer.sampling.corner.plot_pixel`; without
-        it see :func:`polinfer.plots.plot_summary` for ``smooth`` and ``pixel_size``.
+        ``pixel`` is an index into P, such as ``(row, column)``, see :func:`polinfer.sampling.corner.plot_pixel`. Maps
+        are drawn without it, see :func:`polinfer.plots.plot_summary` for ``smooth`` and ``pixel_size``.
         """
         if pixel is None:
             return self.summary().plot(smooth=smooth, pixel_size=pixel_size)

@@ -9,13 +9,11 @@ import numpy as np
 if TYPE_CHECKING:
     from .draws import Draws
 
-__all__ = ["to_arviz"]
+__all__ = ["groups", "to_arviz"]
 
 
-def _groups(draws: Draws) -> dict[str, Any]:
+def groups(draws: Draws) -> dict[str, Any]:
     """Datasets by the name of their group."""
-    import xarray
-
     dataset = draws.to_dataset()
     names = {f"parameters.{name}": name for name in draws.model.free}
     names |= {"gain.real": "gain_real", "gain.imag": "gain_imag", "sigma": "sigma"}
@@ -29,7 +27,7 @@ def _groups(draws: Draws) -> dict[str, Any]:
     data = {"measurement.response.real": "response_real", "measurement.response.imag": "response_imag"}
     observed = dataset[list(data)].rename(data)
     observed.attrs = {"convention": dataset.attrs["convention"]}
-    return {"posterior": xarray.Dataset(posterior), "observed_data": xarray.Dataset(observed)}
+    return {"posterior": posterior, "observed_data": observed}
 
 
 def to_arviz(draws: Draws) -> Any:
@@ -43,10 +41,10 @@ def to_arviz(draws: Draws) -> Any:
         import arviz
     except ImportError as error:
         raise ImportError("to_arviz needs ArviZ, which is not installed: pip install 'polinfer[arviz]'.") from error
-    groups = _groups(draws)
+    found = groups(draws)
     # version 1 answers for the old name, too, with something else
     if int(arviz.__version__.split(".")[0]) < 1:
-        return arviz.InferenceData(**groups)
+        return arviz.InferenceData(**found)
     import xarray
 
-    return xarray.DataTree.from_dict(groups)
+    return xarray.DataTree.from_dict(found)

@@ -13,7 +13,7 @@ from .. import storage
 from ..checks import real_number
 from ..model import Model
 from ..records import PERIODS, RANGES, Parameters, Status
-from ..storage import array
+from ..storage import array, setting
 from .blocks import blocks, flat, rows
 from .diagnostics import NO_DRAWS, diagnose
 
@@ -50,7 +50,7 @@ class Summary:
     std: Parameters = array(("*P",), "rad")
     low: Parameters = array(("*P",), "rad")
     high: Parameters = array(("*P",), "rad")
-    level: float
+    level: float = setting()
     status: np.ndarray = array(("*P",), "1")
     ess: np.ndarray = array(("*P",), "1")
     r_hat: np.ndarray = array(("*P",), "1")

@@ -11,6 +11,7 @@ from polinfer import ComplexGain, InferredNoise, Measurement, Model, Parameters,
 from polinfer.plots import plot_summary
 from polinfer.sampling.corner import plot_pixel
 from polinfer.sampling.draws import Draws
+from polinfer.sampling.export import groups
 from polinfer.sampling.predictive import Predictive
 from polinfer.sampling.summaries import Summary
 from tests.polinfer.sampling.made import around, draws_of
@@ -98,6 +99,22 @@ def test_a_dataset_has_names_coordinates_and_units():
     flat = draws_of(shape=(5,)).to_dataset()["parameters.retardance"]
     assert flat.dims == ("chain", "draw", "pixel_0")
     assert full().summary().to_dataset()["high.retardance"].dims == ("y", "x")
+
+
+@pytest.mark.parametrize("shape", [(), (2, 3)])
+def test_what_is_handed_to_others_are_the_free_parameters_and_the_data(shape):
+    model = Model(gain=PhaseGain(), fixed={"retardance_angle": 0.0})
+    draws = draws_of(model, shape, gain=np.ones((4, 250, *shape)) * np.exp(0.3j))
+    found = groups(draws)
+    posterior, observed = found["posterior"], found["observed_data"]
+    # neither the fixed parameter nor the one that drops out
+    assert set(posterior) == {"diattenuation", "diattenuation_angle", "retardance", "gain_real", "gain_imag"}
+    np.testing.assert_array_equal(posterior["retardance"], draws.parameters.retardance)
+    np.testing.assert_array_equal(posterior["gain_imag"], draws.gain.imag)
+    assert posterior["retardance"].attrs["units"] == "rad"
+    assert posterior["retardance"].dims == ("chain", "draw", "y", "x")[: 2 + len(shape)]
+    np.testing.assert_array_equal(observed["response_real"], draws.measurement.response.real)
+    assert set(groups(full())["posterior"]) == {*Parameters._fields, "gain_real", "gain_imag", "sigma"}
 
 
 @pytest.mark.filterwarnings("ignore")
