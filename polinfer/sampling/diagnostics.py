@@ -154,7 +154,8 @@ def effective_sample_size(values: Any) -> np.ndarray:
 
     ``tau = -1 + 2 sum_k (rho_2k + rho_2k+1)``, the sum ended by Geyer's initial monotone sequence; the autocorrelation
     rho is that of the halves of all chains together and falls short of 1 where the halves disagree. At most
-    ``m n log10(m n)``. Draws that are all the same count as independent.
+    ``m n log10(m n)``. Draws that are all the same count as independent. Where successive draws of a chain come from
+    different walkers in turn, a memory of each walker for itself is not seen: thin until there is none.
 
     Parameters
     ----------
