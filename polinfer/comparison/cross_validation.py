@@ -66,7 +66,8 @@ def leave_one_out(draws: Any) -> LeaveOneOut:
 
     parameters = {name: flat(getattr(draws.parameters, name)) for name in Parameters._fields}
     gain, sigma = (None if x is None else flat(x) for x in (draws.gain, draws.sigma))
-    known = np.all([np.isfinite(parameters[name][0]) for name in model.free], axis=0)
+    drawn = [parameters[name] for name in model.free] + [x for x in (gain, sigma) if x is not None]
+    known = np.all([np.isfinite(x[0]) for x in drawn], axis=0)
     good = np.flatnonzero(known)
     size = max(1, BLOCK // (count * n))
     for begin in range(0, len(good), size):

@@ -89,7 +89,7 @@ def ordering_screen(measurement: Measurement) -> OrderingScreen:
     square = weight * values[:, usable] ** 2
     count = square.shape[1]
     with np.errstate(invalid="ignore", divide="ignore"):
-        terms = (square - noise) / noise.mean(axis=1, keepdims=True)
+        terms = (square - noise) / (noise.sum(axis=1, keepdims=True) / max(count, 1))
     lead, scatter = _sum(0.5 * (terms[1] - terms[0]))
     excess, error = (np.array(x) / max(count, 1) for x in zip(*(_sum(x) for x in terms), strict=True))
     found = count > 1 and abs(lead) >= OUTSTANDING * scatter and lead != 0
