@@ -81,7 +81,7 @@ def test_leave_one_out_is_the_predictive_density_of_each_state():
     rng = np.random.default_rng(3)
     states = rng.normal(size=(2, 5)) + 1j * rng.normal(size=(2, 5))
     weight = np.array([1.0, 0.5, 0.0, 2.0, 1.0])
-    draws, expected = conjugate(states, 0.5, 2000, rng, weight)
+    draws, expected = conjugate(states, 0.5, 8000, rng, weight)
     found = leave_one_out(draws)
     off = np.abs(found.state - expected)
     assert np.all(off[found.pareto_k < 0.5] < 0.06)
