@@ -18,7 +18,7 @@ from ..statistics import Statistics
 
 __all__ = ["draw_nuisances"]
 
-NODES, BLOCK = 2048, 512  # of the table from which 1 / sigma^2 is drawn; draws that are tabulated at once
+NODES, BLOCK = 1024, 512  # of the table from which 1 / sigma^2 is drawn; draws that are tabulated at once
 HIGHEST = 0.46883  # of sqrt(x) I_0(x) e^-x
 
 
