@@ -1,6 +1,7 @@
 """States, gains, orderings, priors and models that several files of tests share, and how pixels are drawn from them.
 
-Code is compiled for each model, number of states and number of pixels: what is shared here is compiled once.
+Code is compiled for each model, number of states and number of pixels, and for one sigma apart from one for each pixel:
+what is shared here is compiled once. ``simulate`` gives each pixel its sigma.
 """
 
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import numpy as np
 from polinfer import (
     AxialVonMises,
     ComplexGain,
+    Measurement,
     Model,
     Ordering,
     Parameters,
@@ -125,6 +127,11 @@ def general(model):
     """The same densities by the general route."""
     name = model.free[-1]
     return replace(model, priors=dict(model.priors) | {name: Same(model.priors[name])})
+
+
+def measured(response, sigma):
+    """Responses (*P, 2, 3) to the balanced states, every pixel with its own sigma, as ``simulate`` gives it."""
+    return Measurement(BALANCED, response, np.full(response.shape[:-2], sigma))
 
 
 def oracle_posterior(x, u, v, sigma, gain, ordering):

@@ -19,6 +19,7 @@ from tests.polinfer.scenes import (
     drawn,
     fitted,
     general,
+    measured,
 )
 
 
@@ -26,7 +27,7 @@ def frame(shape, seed=1, sigma=0.05):
     rng, count = np.random.default_rng(seed), int(np.prod(shape))
     # code is compiled for every number of pixels: the small frames are cut from one
     data = simulate(FREE, drawn(FREE, max(count, 64), rng), BALANCED, sigma, rng=rng)
-    return Measurement(BALANCED, data.response[:count].reshape(*shape, 2, 3), sigma)
+    return measured(data.response[:count].reshape(*shape, 2, 3), sigma)
 
 
 def assert_equal(one, other, where=..., there=..., atol=0.0):

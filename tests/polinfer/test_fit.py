@@ -31,6 +31,7 @@ from tests.polinfer.scenes import (
     UNBALANCED,
     Sandwich,
     everywhere,
+    measured,
     oracle_posterior,
     uniform,
 )
@@ -91,13 +92,13 @@ def test_hard_corners_converge_and_are_never_nan_where_ok(gain):
 
 def test_retardance_beyond_half_a_wave_ends_on_its_bound_without_gain():
     beyond = oracle.jones((0.1, 0.3, np.pi + 0.1, 0.6, 0.2))
-    data = Measurement(BALANCED, beyond @ BALANCED, 0.02)
+    data = measured(np.stack([beyond @ BALANCED] * 2), 0.02)
     result = fit(Model(), data)
-    assert abs(float(result.parameters.retardance)) == pytest.approx(np.pi, abs=1e-6)
-    assert int(result.status) & Status.AT_EDGE
+    np.testing.assert_allclose(np.abs(result.parameters.retardance), np.pi, rtol=0, atol=1e-6)
+    assert (result.status & int(Status.AT_EDGE)).all()
     free = fit(Model(gain=PhaseGain()), data)
-    assert not int(free.status) & Status.AT_EDGE
-    assert abs(float(free.parameters.retardance)) == pytest.approx(np.pi - 0.1, abs=0.01)
+    assert not (free.status & int(Status.AT_EDGE)).any()
+    np.testing.assert_allclose(np.abs(free.parameters.retardance), np.pi - 0.1, rtol=0, atol=0.01)
 
 
 def test_reported_maximum_is_the_canonical_member_of_the_best_orbit():
@@ -159,7 +160,7 @@ def test_masked_and_nan_pixels_are_flagged_and_disturb_no_other():
 
 
 def test_a_frame_without_any_good_pixel_is_all_nan_and_flagged():
-    result = fit(Model(gain=PhaseGain()), Measurement(BALANCED, np.full((3, 2, 3), np.nan + 0j), 0.1))
+    result = fit(Model(gain=PhaseGain()), measured(np.full((3, 2, 3), np.nan + 0j), 0.1))
     assert (result.status == Status.NON_FINITE).all()
     assert np.isnan(result.parameters.diattenuation).all()
 
@@ -167,7 +168,7 @@ def test_a_frame_without_any_good_pixel_is_all_nan_and_flagged():
 def test_a_wrong_sigma_is_a_bad_fit():
     data = simulate(Model(), uniform(30, seed=3), BALANCED, 0.05, rng=1)
     assert np.mean(fit(Model(), data).status & int(Status.BAD_FIT) != 0) < 0.1
-    wrong = Measurement(BALANCED, data.response, 0.01)
+    wrong = measured(data.response, 0.01)
     assert np.mean(fit(Model(), wrong).status & int(Status.BAD_FIT) != 0) > 0.9
 
 
@@ -179,10 +180,10 @@ def test_what_the_data_do_not_constrain_is_flagged():
 
 
 def test_dark_pixels_return_the_prior_and_say_so():
-    result = fit(Model(gain=GAINS["complex"]), Measurement(BALANCED, 0 * BALANCED, 1e3))
-    assert int(result.status) & Status.UNIDENTIFIED_RETARDANCE
-    assert float(result.parameters.diattenuation) == pytest.approx(0, abs=1e-4)
-    assert float(result.parameters.circularity) == pytest.approx(0, abs=1e-4)
+    result = fit(Model(gain=GAINS["complex"]), measured(np.zeros((2, 2, 3), complex), 1e3))
+    assert (result.status & int(Status.UNIDENTIFIED_RETARDANCE)).all()
+    np.testing.assert_allclose(result.parameters.diattenuation, 0, atol=1e-4)
+    np.testing.assert_allclose(result.parameters.circularity, 0, atol=1e-4)
 
 
 @pytest.mark.parametrize("states", [1, 2])
