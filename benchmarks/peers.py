@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from matplotlib.patheffects import withStroke
 
 from benchmarks import scenes
 from benchmarks.oracle import Oracle
@@ -122,16 +123,19 @@ def main(size: int | None = None) -> None:
     results.save(picture(results.rows))
 
 
-STYLES = {  # colour, marker, size, and where the label stands in both figures: points to the right and up
-    "fit": ("C3", "o", 8, (0, 13), (0, 13)),
-    "decompose": ("C1", "s", 7, (0, 13), (0, 13)),
-    "optimistix LM": ("C0", "^", 7, (-3, 60), (-3, 62)),
-    "SciPy LM": ("C0", "v", 7, (-3, 46), (-3, 48)),
-    "SciPy TRF": ("C0", "D", 6, (-3, 32), (-3, 34)),
-    "SciPy L-BFGS-B": ("C0", "P", 7, (-3, 18), (-3, 20)),
-    "NumPyro NUTS": ("C2", "X", 8, (-40, -18), (-50, 0)),
-    "emcee": ("C2", "*", 11, (4, -14), (4, 12)),
+STYLES = {  # colour, marker, size
+    "fit": ("C3", "o", 8),
+    "decompose": ("C1", "s", 7),
+    "optimistix LM": ("C0", "^", 7),
+    "SciPy LM": ("C0", "v", 7),
+    "SciPy TRF": ("C0", "D", 6),
+    "SciPy L-BFGS-B": ("C0", "P", 7),
+    "NumPyro NUTS": ("C2", "X", 8),
+    "emcee": ("C2", "*", 11),
 }
+OWN = ("fit", "decompose")
+BESIDE = {"NumPyro NUTS": ((-40, -18), (-50, 0)), "emcee": ((4, -14), (4, 13))}  # labels of both figures: points
+HALO = [withStroke(linewidth=2.5, foreground="white")]
 NAMES = {1_000_000: "$10^6$"}
 NOTE = (
     "Three states, truths from the priors, double precision. Everybody is judged on the same {} pixels; small numbers: "
@@ -149,8 +153,8 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.2, 1))
     for column, sigma in enumerate(SIGMAS):
         own = [row for row in rows if row["sigma"] == sigma]
-        _draw(axes[0, column], own, "error_over_bound", 3)
-        _draw(axes[1, column], own, "below_best_percent", 4)
+        _draw(axes[0, column], own, "error_over_bound", 0)
+        _draw(axes[1, column], own, "below_best_percent", 1)
         _references(axes[:, column], own)
         axes[0, column].set_title(f"noise: sigma = {sigma:g}", weight="bold")
         axes[1, column].set_xlabel("microseconds a pixel, compiling apart")
@@ -160,30 +164,44 @@ def picture(rows: list[dict[str, Any]]) -> Figure:
     axes[0, 0].set(xlim=(0.3, 1e7), ylim=(0.93 * min([1, *errors]), 1.1 * max(errors)))
     axes[0, 0].yaxis.set_major_formatter("{x:g}")
     axes[0, 0].yaxis.set_minor_locator(NullLocator())
-    axes[1, 0].set(ylim=(-9, 106), ylabel=f"% of pixels {TOLERANCE:g} nat below best mode")
+    axes[1, 0].set(ylim=(-55, 106), yticks=range(0, 101, 20), ylabel=f"% of pixels {TOLERANCE:g} nat below best mode")
     figure.supxlabel(NOTE.format(PIXELS, STARTS), size=8, color="0.3")
     return figure
 
 
-def _draw(axes: Axes, rows: list[dict[str, Any]], key: str, place: int) -> None:
+def _draw(axes: Axes, rows: list[dict[str, Any]], key: str, figure: int) -> None:
     axes.grid(alpha=0.25, lw=0.6)
-    for name, style in STYLES.items():
-        own = [row for row in rows if row.get("method") == name]
-        if not own:
-            continue
-        color, marker, size, offset = *style[:3], style[place]
-        points = [(row["microseconds_a_pixel"], row[key]) for row in own]
-        axes.plot(*zip(*points, strict=True), marker + "-", color=color, ms=size, lw=1.2)
-        text = {"textcoords": "offset points", "color": color, "ha": "center"}
-        if name in ("fit", "decompose"):
-            for row, point in zip(own, points, strict=True):
-                pixels = row["pixels"]
-                axes.annotate(NAMES.get(pixels, pixels), point, (0, -6), va="top", size=7, **text)
-            text["weight"] = "bold"
-        if offset[0] == -3:  # above its own line
-            text["arrowprops"] = {"arrowstyle": "-", "color": color, "lw": 0.6, "shrinkA": 0, "relpos": (0, 0)}
-            text["ha"] = "left"
-        axes.annotate(name, points[len(own) // 2], offset, va="center", size=9, **text)
+    points: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        if "method" in row:
+            points.setdefault(row["method"], []).append((row["microseconds_a_pixel"], row[key]))
+    # equally good ones stand in a row: labels above or below them, the fastest one's furthest
+    crowd = sorted((name for name in points if name not in OWN and name not in BESIDE), key=lambda n: -points[n][-1][0])
+    for name, places in points.items():
+        color, marker, size = STYLES[name]
+        axes.plot(*zip(*places, strict=True), marker + "-", color=color, ms=size, lw=1.2)
+        text: dict[str, Any] = {"textcoords": "offset points", "color": color, "va": "center", "size": 9}
+        if name in crowd:
+            line = {"arrowstyle": "-", "color": color, "lw": 0.6, "shrinkA": 0, "relpos": (0, figure)}
+            height = (1 - 2 * figure) * (18 + 13 * crowd.index(name))
+            axes.annotate(name, places[-1], (-3, height), ha="left", arrowprops=line, path_effects=HALO, **text)
+        elif name in BESIDE:
+            axes.annotate(name, places[-1], BESIDE[name][figure], ha="center", **text)
+        else:
+            axes.annotate(name, places[len(places) // 2], (0, 13), ha="center", weight="bold", **text)
+            _sizes(axes, [row for row in rows if row.get("method") == name], key, color)
+
+
+def _sizes(axes: Axes, rows: list[dict[str, Any]], key: str, color: str) -> None:
+    """The number of pixels below each point, as far as there is room."""
+    done: list[float] = []
+    for row in (rows[0], *rows[:0:-1]):
+        x = row["microseconds_a_pixel"]
+        if all(abs(np.log10(x / other)) > 0.3 for other in done):
+            name = NAMES.get(row["pixels"], row["pixels"])
+            text = {"textcoords": "offset points", "ha": "center", "va": "top", "size": 7, "color": color}
+            axes.annotate(name, (x, row[key]), (0, -6), **text)
+            done.append(x)
 
 
 def _references(axes: Any, rows: list[dict[str, Any]]) -> None:
@@ -199,8 +217,7 @@ def _references(axes: Any, rows: list[dict[str, Any]]) -> None:
     axes[0].annotate(note, (0.98, 0.97), xycoords="axes fraction", ha="right", va="top", size=8, color="C3")
     for axis in axes:
         axis.axvline(svd, color="0.3", lw=0.8, ls=":")
-    axes[1].annotate("numpy.linalg.svd", (svd, 0.97), (-3, 0), xycoords=("data", "axes fraction"), rotation=90,
-                     ha="right", va="top", **text)  # fmt: skip
+    axes[1].annotate("numpy.linalg.svd", (svd, 0.04), (4, 0), xycoords=("data", "axes fraction"), va="bottom", **text)
 
 
 if __name__ == "__main__":

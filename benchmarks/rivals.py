@@ -133,7 +133,7 @@ def _polinfer(scene: Scene, call: Callable[[Measurement], Parameters]) -> list[A
         data = scene.first(pixels)
         kept: list[Parameters] = []
         times = np.array([seconds(lambda d=data, k=kept: k.append(call(d))) for _ in range(1 + REPEATS)])
-        found.append(_answer(pixels, kept[-1], times[1:] / pixels, times[0] - float(np.median(times[1:]))))
+        found.append(_answer(pixels, kept[-1], times[1:] / pixels, max(0, times[0] - np.median(times[1:]))))
     return found
 
 
@@ -188,7 +188,7 @@ def _one_by_one(scene: Scene, pixel: Callable[[np.ndarray], np.ndarray]) -> Answ
     found: list[np.ndarray] = []
     with threadpool_limits(1):  # threads that wait for each other slow down five unknowns
         times = np.array([seconds(lambda r=response: found.append(pixel(r))) for response in responses])
-    return _answer(len(responses), _points(found), times, compiling - times[0])
+    return _answer(len(responses), _points(found), times, max(0, compiling - times[0]))
 
 
 def optimistix(scene: Scene) -> list[Answer]:
