@@ -1,9 +1,9 @@
 """Can the data tell the order of polariser and retarder, and does a comparison of models say so when they can?
 
 How different are the two orderings: the paper's figure, with its percentages corrected. How often the verdict of
-:func:`polinfer.compare` is right, wrong and undecided, beside what :func:`polinfer.power` says, and where the border is.
-Sums of log Bayes factors where D is within its noise, against their scatter. Whether :func:`polinfer.select` leaves out
-what a scene does not need, and finds what made it.
+:func:`polinfer.compare` is right, wrong and undecided, beside :func:`polinfer.power`, and where the border is.
+Sums of log Bayes factors where D is within its noise, against their scatter. Whether :func:`polinfer.select` leaves
+out what a scene does not need, and finds what made it.
 """
 
 from __future__ import annotations
@@ -96,19 +96,28 @@ def scatter(results: Results, scenes: int) -> None:
     rng = np.random.default_rng(7)
     kinds = {"balanced": balanced_states(), "condition 5": conditioned_states(5.0, np.random.default_rng(0))}
     for (kind, states), sigma, size in product(kinds.items(), (0.02, 0.1), (0.0, 0.01)):
-        said, sums, screens = [], [], []
+        said, sums, screens, three = [], [], [], []
         for _ in range(scenes):
             data = polinfer.simulate(ORDERINGS["polariser_first"], truths(PIXELS, size, rng), states, sigma, rng=rng)
-            found = compare({name: polinfer.fit(model, data) for name, model in ORDERINGS.items()})
+            fits = {name: polinfer.fit(model, data) for name, model in ORDERINGS.items()}
+            found = compare(fits)
             said.append(found.verdict)
+            three.append(compare(fits | {"no_diattenuation": polinfer.fit(RETARDER, data)}).verdict)
             sums.append(found.pooled[1] - found.pooled[0])
             screens.append(ordering_screen(data).verdict)
         sure = np.mean(np.array(sums) < -np.log(19))
         results.add(states=kind, sigma=sigma, D=size, truth="polariser_first", scenes=scenes,
                     mean_sum_nat=float(np.mean(sums)), spread_nat=float(np.std(sums)), bayes_alone_wrong=float(sure),
                     wrong=float(np.mean(np.array(said) == "retarder_first")),
+                    of_three_wrong=float(np.mean(np.array(three) == "retarder_first")),
+                    of_three_none=float(np.mean(np.array(three) == "no_diattenuation")),
                     screen_wrong=float(np.mean(np.array(screens) == "retarder_first")),
                     screen_right=float(np.mean(np.array(screens) == "polariser_first")))  # fmt: skip
+    rows = [row for row in results.rows if "of_three_wrong" in row]
+    worst = max(row["of_three_wrong"] for row in rows)
+    results.bar("D within its noise, a model without D offered too: wrong ordering, worst case", worst, 0.05)
+    results.bar("  the closed-form screen: wrong ordering, all cases",
+                float(np.mean([row["screen_wrong"] for row in rows])), 0.05)  # fmt: skip
 
 
 def needs(results: Results, scenes: int) -> None:

@@ -21,7 +21,8 @@ def compare_command(ctx: click.Context, files: tuple[Path, ...], picture: Path |
     """Compare models of the same data by their evidence, and print which one the data speak for.
 
     FILES are two or more results (fits or draws), named by their file names, or one measurement, which is fitted with
-    both orderings of the model that the options declare.
+    both orderings of the model that the options declare, and with the same model without diattenuation, which is what
+    the orderings have in common.
 
     Example: polinfer compare retarder_first.nc polariser_first.nc --picture evidence.png
 
@@ -41,6 +42,9 @@ def compare_command(ctx: click.Context, files: tuple[Path, ...], picture: Path |
         models = {
             name: declared_model(**(declared | {"ordering": name})) for name in ("retarder_first", "polariser_first")
         }
+        if "diattenuation" in models["retarder_first"].free:
+            fixed = declared["fix"] + ("diattenuation=0",)
+            models["no_diattenuation"] = declared_model(**(declared | {"fix": fixed}))
         found = select(models, loaded[files[0]])
     else:
         for path, result in loaded.items():

@@ -16,9 +16,10 @@ Vuong's test for models that overlap, beside the Bayes factor and not instead of
 
 What the rule cannot see is a bias. With balanced states the orderings are mirror images (J and its transpose), and
 where D = 0 their evidences do not differ on average. With unbalanced ones a wide prior of D leaves them different
-volumes: 0.06 nat a pixel at a condition number of 5, 60 nats for a scene that knows nothing. Then give D a prior as
-wide as the scene's own values and an evidence that is exact, or look at
-:func:`polinfer.comparison.ordering_screen`, which has no prior.
+volumes: 0.06 nat a pixel at a condition number of 5, 60 nats for a scene that knows nothing. So offer a model without
+diattenuation beside the two orderings, ``Model(fixed={"diattenuation": 0.0})``: it is what they have in common, and it
+wins where D is within its noise, by far more than that. Or look at :func:`polinfer.comparison.ordering_screen`, which
+has no prior.
 
 Source: Q. H. Vuong, Econometrica 57, 307 (1989).
 """

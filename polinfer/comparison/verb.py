@@ -23,6 +23,10 @@ LAPLACE = (
 )
 UNSEEN = "a Fit does not hold its data: only their shape, mask and sigma could be checked to agree"
 FRAME_SIGMA = "evidences are given the sigma of the frame that was found, not integrated over it"
+NO_COMMON = (
+    "no model is without diattenuation, which is what the orderings have in common: where D is within its noise and "
+    "the states are not balanced, a verdict for one can be wrong; compare Model(fixed={'diattenuation': 0.0}) too"
+)
 OTHER_WINDOWS = "probabilities of single pixels are left out: with and without a window they are not of the same data"
 
 
@@ -247,6 +251,9 @@ def _notes(records: list[Any], same: bool) -> tuple[str, ...]:
         notes += [LAPLACE, UNSEEN]
     if any(isinstance(r.model.noise, InferredNoise) and not r.model.noise.integrated for r in records):
         notes.append(FRAME_SIGMA)
+    with_polariser = {r.model.ordering for r in records if r.model.fixed.get("diattenuation") != 0}
+    if len(with_polariser) > 1 and len(records) == sum(r.model.fixed.get("diattenuation") != 0 for r in records):
+        notes.append(NO_COMMON)
     if not same:
         notes.append(OTHER_WINDOWS)
     return tuple(notes)

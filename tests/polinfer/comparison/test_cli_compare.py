@@ -34,7 +34,14 @@ def test_saved_fits_and_a_measurement_give_the_table_of_the_library(files, tmp_p
     assert result.output.strip() == table
     assert "verdict: polariser_first" in table
     assert (tmp_path / "evidence.png").read_bytes()[:4] == b"\x89PNG"
-    assert run(data).output.strip() == table
+    both = [line.split()[:5] for line in table.splitlines() if line.startswith("scene")]
+    fitted = run(data)
+    assert fitted.exit_code == 0, fitted.output
+    three = [line.split()[:5] for line in fitted.output.splitlines() if line.startswith("scene")]
+    assert three[:2] == both
+    assert three[2][1] == "no_diattenuation"
+    assert "verdict: polariser_first" in fitted.output
+    assert "no_diattenuation" not in run(data, "--fix", "diattenuation=0.4").output
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
