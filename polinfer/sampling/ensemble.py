@@ -35,15 +35,15 @@ __all__ = ["Ensemble", "draw_ensemble"]
 CANDIDATES = 2048  # points that are weighed to find where the walkers start
 LEAST_WEIGHT = 0.05  # share of the candidates that must keep some weight
 COMPONENTS = 3
+# Not DESnookerMove: up to emcee 3.1.6 at least its step is not reversible, and draws of a Gaussian come out too narrow.
 MOVES: tuple[tuple[str, dict[str, float], float], ...] = (
-    ("DEMove", {}, 0.35),
+    ("DEMove", {}, 0.4),
     ("DEMove", {"gamma0": 1.0}, 0.05),
-    ("DESnookerMove", {}, 0.1),
-    ("StretchMove", {}, 0.2),
+    ("StretchMove", {}, 0.25),
 )
 MIXTURE = 0.3  # share of the steps that propose from the mixture found at the start
 DEFENCE = 0.1
-LEAST_EFFICIENT, MOST_R_HAT = 100.0, 1.05
+LEAST_EFFECTIVE, LEAST_TIMES, MOST_R_HAT = 100.0, 5.0, 1.05
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Ensemble:
     """
 
     walkers: int = 32
-    warmup: int = 200
-    thin: int = 10
+    warmup: int = 300
+    thin: int = 20
     backend: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -121,8 +121,9 @@ def draw_ensemble(
     order). The random numbers of an ensemble come from ``SeedSequence([seed, flat index of the pixel, ensemble])``, so
     they do not depend on the other pixels. With neighbours the parameters are those of the window around each pixel;
     gain and sigma are those of the pixel itself, drawn given the parameters (None where the model has none to infer).
-    The evidence comes from bridge sampling between the second half of the records and a mixture fitted to the first.
-    ``converged``: split R-hat below 1.05 and at least 100 effective draws for the elements of J, counted along time.
+    ``converged``: of every coordinate, split R-hat is below 1.05, there are at least 100 effective draws, and the
+    records are five autocorrelation times of a walker long. Then the evidence comes from bridge sampling between the
+    second half of the records and a mixture fitted to the first; else it is NaN, as its error could not be trusted.
 
     Raises
     ------
@@ -219,14 +220,11 @@ def _run(
     kept: Checkpoint | None,
 ) -> _Chain:
     """One ensemble: start, warm up, record; or go on from a checkpoint."""
-    from emcee import EnsembleSampler, State, moves
+    from emcee import State
 
     first, later = stream.spawn(2)
     start, proposal = _spread(target, covariance, sampler.walkers, np.random.default_rng(first))
-    chosen = [(getattr(moves, name)(**settings), share) for name, settings, share in MOVES]
-    engine = EnsembleSampler(
-        *start.shape, target, moves=[*chosen, (moves.MHMove(_independent(proposal)), MIXTURE)], vectorize=True
-    )
+    engine = _engine(target, proposal, start.shape)
     state = State(start, random_state=np.random.RandomState(np.random.MT19937(later)).get_state())
     places = np.empty((records, *start.shape))
     values = np.empty((records, len(start)))
@@ -243,6 +241,15 @@ def _run(
         if kept is not None:
             kept.write(places[:done], values[:done], step, last=done == records)
     return _Chain(places, values)
+
+
+def _engine(target: Any, proposal: Proposal, shape: tuple[int, ...]) -> Any:
+    """emcee with our mix of moves."""
+    from emcee import EnsembleSampler, moves
+
+    mixed = [(getattr(moves, name)(**settings), share) for name, settings, share in MOVES]
+    mixed.append((moves.MHMove(_independent(proposal)), MIXTURE))
+    return EnsembleSampler(*shape, target, moves=mixed, vectorize=True)
 
 
 def _advance(engine: Any, state: Any, records: int, thin: int) -> Iterator[Any]:
@@ -322,33 +329,36 @@ def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, s
     kept = Parameters(*(x[:, :draws] for x in parameters))
     drawn = [draw_nuisances(target.model, own, m[:draws], r) for m, r in zip(matrices, streams, strict=True)]
     gain, sigma = (None if x[0] is None else np.stack(x) for x in zip(*drawn, strict=True))
-    half = places.shape[1] // 2
+    converged = _converged(target, places, values)
     evidence = Bridge(np.nan, np.nan)
-    if half * chains * places.shape[2] >= 20 * k:
+    if converged:
+        half = places.shape[1] // 2
         rng = np.random.default_rng(np.random.SeedSequence([*seed, chains, 2]))
         mixture = fit_mixture(places[:, :half].reshape(-1, k), COMPONENTS, rng)
         proposal = _defended(target, mixture, DEFENCE)
         evidence = bridge(target, places[:, half:], values[:, half:], proposal, rng)
-    return _Pixel(kept, gain, sigma, evidence, _converged(target.model, matrices, values))
+    return _Pixel(kept, gain, sigma, evidence, converged)
 
 
-def _converged(model: Model, matrices: np.ndarray, values: np.ndarray) -> bool:
-    """Whether the elements of J, up to a phase where the gain has it, agree between and within the ensembles."""
-    vectors = matrices.reshape(*values.shape, 4)
-    if model.known_gain.free_phase:
-        vectors = (vectors[..., :, None] * np.conj(vectors[..., None, :])).reshape(*values.shape, 16)
-    series = np.concatenate([vectors.real, vectors.imag, values[..., None]], axis=-1)
-    length = values.shape[1] // 2
+def _converged(target: Target, places: np.ndarray, values: np.ndarray) -> bool:
+    """Whether the coordinates agree between the ensembles, and walkers have forgotten where they were.
+
+    Circles count by their cosine and sine, so that it does not matter in which turn a walker is.
+    """
+    period = periods(target.model)
+    circle = np.isfinite(period)
+    phase = 2 * np.pi * (places[..., circle] - target.centre[circle]) / period[circle]
+    series = np.concatenate([np.cos(phase), np.sin(phase), places[..., ~circle], values[..., None]], axis=-1)
+    records = values.shape[1]
+    length = records // 2
     if length < 2:
         return False  # so few records say nothing
     halves = series[:, : 2 * length].reshape(2 * len(values), -1, series.shape[-1])
     for i in range(series.shape[-1]):
-        within = halves[..., i].var(axis=1).mean()
-        if within <= 1e-14:  # an element that the model keeps
-            continue
-        between = halves[..., i].mean(axis=1).var(ddof=1)
-        enough = values.size / autocorrelation_time(series[..., i]) >= LEAST_EFFICIENT
-        if not enough or 1 + between / within > MOST_R_HAT**2:
+        time = autocorrelation_time(series[..., i])
+        forgotten = records >= LEAST_TIMES * time and values.size >= LEAST_EFFECTIVE * time
+        within, between = halves[..., i].var(axis=1).mean(), halves[..., i].mean(axis=1).var(ddof=1)
+        if not forgotten or not within + between <= MOST_R_HAT**2 * within:
             return False
     return True
 
