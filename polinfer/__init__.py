@@ -2,6 +2,7 @@
 
 from . import conventions, datasets, phantoms
 from .bounds import cramer_rao_bound
+from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
 from .files import load
@@ -14,13 +15,18 @@ from .noise import InferredNoise, KnownNoise
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .priors import AxialVonMises, Prior, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters, Status
+from .sampling import Draws, Ensemble, Gibbs, sample
 from .simulation import simulate
 from .storage import save
 
 __all__ = [
     "AxialVonMises",
+    "Comparison",
     "ComplexGain",
+    "Draws",
+    "Ensemble",
     "Fit",
+    "Gibbs",
     "InferredNoise",
     "KnownNoise",
     "Measurement",
@@ -37,6 +43,7 @@ __all__ = [
     "VonMises",
     "Window",
     "canonicalise",
+    "compare",
     "conventions",
     "cramer_rao_bound",
     "datasets",
@@ -45,8 +52,12 @@ __all__ = [
     "load",
     "orbit",
     "ordering_error",
+    "ordering_screen",
     "phantoms",
+    "power",
+    "sample",
     "save",
+    "select",
     "simulate",
     "smooth_gauge",
 ]

@@ -17,6 +17,8 @@ from .priors import AxialVonMises, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters
 from .sampling.diagnostics import Diagnostics
 from .sampling.draws import Draws
+from .sampling.ensemble import Ensemble
+from .sampling.gibbs import Gibbs
 from .sampling.predictive import Predictive
 from .sampling.summaries import Summary
 
@@ -24,7 +26,7 @@ __all__ = ["TYPES", "load"]
 
 TYPES: tuple[type, ...] = (
     Measurement, Fit, Phantom, FibreMatrix, Parameters, Model,
-    Draws, Summary, Diagnostics, Predictive,
+    Draws, Summary, Diagnostics, Predictive, Gibbs, Ensemble,
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
     KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,

@@ -19,7 +19,8 @@ from .point import Point, matrix, polariser_vectors, retarder_vectors, rotate, u
 from .priors import COPIES, Term, log_prior
 from .scene import Scene
 
-__all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "precise_enough"]
+__all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "lowest_pivot", "moved",
+           "precise_enough"]  # fmt: skip
 
 LONGEST_STEP = 0.7  # radians of any angle y
 LEAST_CURVATURE = 1e-6  # of a direction of which neither data nor prior say anything
@@ -130,6 +131,11 @@ def precise_enough(data: Data) -> Any:
     return tolerance(dtype) + 20 * (jnp.finfo(dtype).eps * data.strength) ** 2
 
 
+def lowest_pivot(data: Data) -> Any:
+    """Pivots of the Hessian above it may be 0: of a direction of which neither data nor prior say anything."""
+    return -LEAST_CURVATURE - 8 * jnp.finfo(data.strength.dtype).eps * data.strength**2
+
+
 def _project(scene: Scene, point: Point) -> Point:
     """Back onto the ranges of bounded angles."""
     if 0 in scene.free:
@@ -183,7 +189,7 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         return jax.tree.map(partial(jnp.where, exchange), better_copy(scene, point), point)
 
     eps = jnp.finfo(data.strength.dtype).eps
-    enough = precise_enough(data)
+    enough, lowest = precise_enough(data), lowest_pivot(data)
     free = scene.free
 
     def advance(carry: Any) -> Any:
@@ -202,7 +208,7 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         lower, smallest = factorise(a, len(free), LEAST_CURVATURE)
         step, decrement = solve(lower, [slope.gradient[i] for i in free])
         decrement = decrement / data.one
-        arrived = (decrement < enough) & (smallest > 0) & (damping == 0)
+        arrived = (decrement < enough) & (smallest > lowest) & (damping == 0)
         pairs = list(point)
         for i, x in zip(free, step, strict=True):
             pairs[i] = rotate(point[i], jnp.clip(x, -LONGEST_STEP, LONGEST_STEP))

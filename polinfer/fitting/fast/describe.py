@@ -12,7 +12,17 @@ import jax.numpy as jnp
 from ...degeneracy import REFERENCE
 from ...records import PERIODS, Parameters
 from ..local_gaussian import uniform_std
-from .climb import derivatives, evaluate, frozen, held, kept, precise_enough, with_prior
+from .climb import (
+    LEAST_CURVATURE,
+    derivatives,
+    evaluate,
+    frozen,
+    held,
+    kept,
+    lowest_pivot,
+    precise_enough,
+    with_prior,
+)  # fmt: skip
 from .data import Data
 from .linear import Triangle, factorise, inverse, solve
 from .point import Point
@@ -146,11 +156,11 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
     free, n = scene.free, len(scene.free)
     at_index = {i: m for m, i in enumerate(free)}
     a = {(m, k): -local.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
-    lower, smallest = factorise(a, n)
+    lower, smallest = factorise(a, n, LEAST_CURVATURE)
     _, decrement = solve(lower, [local.gradient[i] for i in free])
     c = {key: x / data.one for key, x in inverse(lower, n).items()}
     c |= {(k, m): x for (m, k), x in c.items()}
-    flags = jnp.where((decrement < precise_enough(data)) & (smallest > 0), CONVERGED, 0)
+    flags = jnp.where((decrement < precise_enough(data)) & (smallest > lowest_pivot(data)), CONVERGED, 0)
     finite = jnp.isfinite(value)
     # angles of J itself do not depend on how well axes are defined
     sine = [jnp.ones_like(value), point.diattenuation[1], jnp.ones_like(value), point.retardance[1],
@@ -197,7 +207,12 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
             c[m, k] = c[k, m] = jnp.where(where, follow[k], c[k, m])
         c[m, m] = jnp.where(where, 1 / curvature, c[m, m])
 
-    parameters, signs = _choose(scene, data.one, point, _values(scene, point))
+    values = _values(scene, point)
+    if 0 in stuck:  # on the bound, not an ulp off it: the density falls by a square root from there
+        values = values._replace(
+            diattenuation=jnp.where(stuck[0], jnp.sign(values.diattenuation), values.diattenuation)
+        )
+    parameters, signs = _choose(scene, data.one, point, values)
     widths = [2 * cosine, 0.5, 2.0, 0.5, 1.0]
     if 0 in stuck:
         widths[0] = jnp.where(stuck[0], 1.0, widths[0])

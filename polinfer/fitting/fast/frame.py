@@ -45,7 +45,7 @@ def _real_type(values: np.ndarray) -> np.dtype:
     return np.zeros((), jax.dtypes.canonicalize_dtype(values.dtype)).real.dtype
 
 
-def _judge_states(root: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, bool]:
+def judge_states(root: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, bool]:
     """Which illuminations R ``(..., 2, 2)`` are good enough for the closed form, and whether all are balanced."""
     size = np.sum(np.abs(root) ** 2, axis=(-1, -2))
     area = np.abs(root[..., 0, 0] * root[..., 1, 1] - root[..., 0, 1] * root[..., 1, 0])
@@ -66,7 +66,7 @@ def frame_of_responses(model: Model, measurement: Measurement, good: np.ndarray 
     root_weight = np.sqrt(weight.reshape(n).astype(float))
     found = factor(measurement.illumination.reshape(2, n) * root_weight)
     dtype = _real_type(measurement.response)
-    usable, balanced = _judge_states(found.root, dtype)
+    usable, balanced = judge_states(found.root, dtype)
     if not usable:
         return None
     used = root_weight > 0
@@ -90,7 +90,7 @@ def frame_of_responses(model: Model, measurement: Measurement, good: np.ndarray 
 def frame_of_statistics(statistics: Statistics) -> tuple[Summed, np.ndarray]:
     """Pixels ``(pixels, ...)`` with statistics of their own, and which of them the closed form is good enough for."""
     dtype = _real_type(statistics.response)
-    usable, balanced = _judge_states(statistics.illumination, dtype)
+    usable, balanced = judge_states(statistics.illumination, dtype)
     complex_type = np.result_type(dtype, np.complex64)
     cast = Statistics(*(x.astype(complex_type if np.iscomplexobj(x) else dtype, copy=False) for x in statistics))
     return Summed(cast, balanced), usable
@@ -112,7 +112,7 @@ def solve(
 def status_of(model: Model, rows: np.ndarray, edge: np.ndarray) -> np.ndarray:
     """Status bits that follow from the rows: bounds, and what is not identified."""
     dtype = rows.dtype
-    near = 2e-9 if dtype == np.float64 else 2e-5
+    near = 8 * np.finfo(dtype).eps  # on a bound without a slope towards it
     at_edge = edge.copy()
     for name, (low, high) in model.bounds.items():
         value = rows[Parameters._fields.index(name)]

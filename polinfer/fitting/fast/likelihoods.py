@@ -55,7 +55,7 @@ def _energy(model: list[list[Pair]]) -> Any:
     return sum(x * x + y * y for row in model for x, y in row)
 
 
-def _square(model: list[list[Pair]], data: list[list[Pair]], gain: Pair | None) -> Any:
+def square(model: list[list[Pair]], data: list[list[Pair]], gain: Pair | None) -> Any:
     total: Any = 0.0
     for row, other in zip(model, data, strict=True):
         for (x, y), (a, b) in zip(row, other, strict=True):
@@ -72,7 +72,7 @@ class Unit:
 
     def residual(self, model: list[list[Pair]], data: list[list[Pair]]) -> Residual:
         """What the other methods need of a matrix."""
-        return Residual((1.0, 0.0), _square(model, data, None), None, (None, None))
+        return Residual((1.0, 0.0), square(model, data, None), None, (None, None))
 
     def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""
@@ -97,7 +97,7 @@ class Phase:
         """What the other methods need of a matrix."""
         a = _overlap(model, data)
         gain = unit(*a)
-        return Residual(gain, _square(model, data, gain), _energy(model), a)
+        return Residual(gain, square(model, data, gain), _energy(model), a)
 
     def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""
@@ -137,7 +137,7 @@ class Complex:
         a, m = _overlap(model, data), _energy(model)
         weight = 1 / (m + self.precision)
         gain = (a[0] * weight, a[1] * weight)
-        return Residual(gain, _square(model, data, gain), m, a)
+        return Residual(gain, square(model, data, gain), m, a)
 
     def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""

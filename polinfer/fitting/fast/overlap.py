@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 from .point import Pair, Point, Vector, dot, polariser_vectors, retarder_vectors
 
-__all__ = ["Derivatives", "Pauli", "coefficients", "energy", "overlap", "overlap_slopes", "pauli", "turned"]
+__all__ = ["Derivatives", "Pauli", "coefficients", "energy", "overlap", "overlap_slopes", "pauli", "quadratic_forms",
+           "turned"]  # fmt: skip
 
 FREE_PAIRS = [(i, j) for i in range(5) for j in range(i, 5)]
 
@@ -86,11 +87,17 @@ def overlap_slopes(t: list[Vector], point: Point) -> tuple[Any, list[Any]]:
     return dot(g, q), gradient
 
 
-def _turn(s: Pauli, q: Vector) -> tuple[Any, Any, list[Vector], list[Vector]]:
-    """The z and x components of the Stokes vector s turned by the retarder, ``q^T M q``, and their matrices M."""
+def quadratic_forms(s: Pauli) -> tuple[list[Vector], list[Vector]]:
+    """Matrices M of the z and x components ``q^T M q`` of the Stokes vector s turned by the retarder."""
     z, x, y = s.z[0], s.x[0], s.y[0]
     z_matrix = [[z, None, y, -x], [None, z, -x, -y], [y, -x, -z, None], [-x, -y, None, -z]]
     x_matrix = [[x, y, None, z], [y, -x, -z, None], [None, -z, x, y], [z, None, y, -x]]
+    return z_matrix, x_matrix
+
+
+def _turn(s: Pauli, q: Vector) -> tuple[Any, Any, list[Vector], list[Vector]]:
+    """The components, and their matrices."""
+    z_matrix, x_matrix = quadratic_forms(s)
     z_image, x_image = ([dot(row, q) for row in m] for m in (z_matrix, x_matrix))
     return dot(q, z_image), dot(q, x_image), z_matrix, x_matrix
 

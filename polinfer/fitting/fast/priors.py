@@ -18,7 +18,7 @@ from ...priors import AxialVonMises, TruncatedNormal, UniformAngle, VonMises
 from ...records import PERIODS, RANGES, Parameters
 from .point import Point
 
-__all__ = ["COPIES", "Flat", "Harmonic", "Normal", "Term", "copies", "terms"]
+__all__ = ["COPIES", "Flat", "Harmonic", "Normal", "Term", "copies", "log_prior", "term", "terms"]
 
 # y = factor * parameter (not for D)
 FACTORS = Parameters(np.nan, 2.0, 0.5, 2.0, 1.0)
@@ -96,7 +96,8 @@ class Normal:
 Term = Flat | Harmonic | Normal
 
 
-def _term(name: str, prior: Any) -> Term | None:
+def term(name: str, prior: Any) -> Term | None:
+    """The prior of a parameter in its angle y, None if it has none of these forms."""
     low, high = getattr(RANGES, name)
     if name == "diattenuation":
         if type(prior) is TruncatedNormal and (prior.low, prior.high) == (low, high):
@@ -131,10 +132,10 @@ def terms(model: Model) -> tuple[Term | None, ...] | None:
         if name not in model.free:
             found.append(None)
             continue
-        term = _term(name, model.priors[name])
-        if term is None:
+        own = term(name, model.priors[name])
+        if own is None:
             return None
-        found.append(term)
+        found.append(own)
     return tuple(found)
 
 

@@ -1,0 +1,11 @@
+"""Full posteriors: samplers, their draws, and what is to be said about them."""
+
+from .diagnostics import Diagnostics
+from .draws import Draws
+from .ensemble import Ensemble
+from .gibbs import Gibbs
+from .predictive import Predictive
+from .summaries import Summary
+from .verb import sample
+
+__all__ = ["Diagnostics", "Draws", "Ensemble", "Gibbs", "Predictive", "Summary", "sample"]

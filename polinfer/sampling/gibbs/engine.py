@@ -1,0 +1,286 @@
+"""A frame through the compiled sweeps: blocks of pixels on all cores, and more sweeps where chains do not agree."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ...fitting.fast.data import times_adjoint
+from ...fitting.fast.engine import pairs_of
+from ...fitting.fast.frame import judge_states
+from ...fitting.fast.overlap import Pauli, pauli
+from ...fitting.fast.point import Point
+from ...fitting.fast.priors import FACTORS
+from ...fitting.generic import Prepared, prepare
+from ...model import Model
+from ...noise import InferredNoise, KnownNoise
+from ...records import Fit, Measurement, Parameters
+from ...statistics import Statistics
+from ..raw import Raw
+from . import kernel
+from .plan import Plan, plan
+from .random import begin
+from .sampler import Gibbs
+from .sweep import Observed, State
+
+__all__ = ["draw_gibbs"]
+
+BLOCKS = (64, 512)  # numbers of pixels for which code is compiled
+BATCH = 25  # draws between two looks at the clock, and the length of the batches of the diagnostics
+MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
+LARGEST_R = 1.05
+SPREAD = 1.5  # standard deviations by which the chains are moved apart at the start
+
+
+class Problem(NamedTuple):
+    """What is drawn from, on the host: statistics by pixels, and the fit that the chains begin at."""
+
+    plan: Plan
+    balanced: bool
+    statistics: Statistics
+    fit: dict[str, np.ndarray]
+    dtype: np.dtype
+
+
+def _statistics(model: Model, measurement: Measurement, good: np.ndarray) -> Statistics:
+    if isinstance(model.noise, InferredNoise) and not model.noise.integrated:
+        model, measurement = replace(model, noise=KnownNoise()), replace(measurement, sigma=np.ones(()))
+    prepared: Prepared = prepare(model, measurement, model.noise.integrated)
+    found = prepared.pooled.take(good)
+    assert isinstance(found, Statistics)
+    return found
+
+
+def _problem(known: Plan, model: Model, measurement: Measurement, fit: Fit, good: np.ndarray) -> Problem:
+    statistics = _statistics(model, measurement, good)
+    dtype = np.zeros((), jax.dtypes.canonicalize_dtype(measurement.response.dtype)).real.dtype
+    lead = (len(good),)
+    shapes = {"illumination": (2, 2), "response": (2, 2)}
+    statistics = Statistics(
+        **{k: np.broadcast_to(v, (*lead, *shapes.get(k, ()))) for k, v in statistics._asdict().items()}
+    )
+    values = {name: np.asarray(x, float).reshape(-1)[good] for name, x in fit.parameters._asdict().items()}
+    values |= {f"std_{name}": np.asarray(x, float).reshape(-1)[good] for name, x in fit.std._asdict().items()}
+    values["sigma"] = np.asarray(fit.sigma, float).reshape(-1)[good]
+    if fit.gain is not None:
+        values["gain"] = np.asarray(fit.gain).reshape(-1)[good]
+    usable, balanced = judge_states(np.asarray(statistics.illumination), dtype)
+    return Problem(known, balanced and bool(usable.all()), statistics, values, dtype)
+
+
+def _elements(a: np.ndarray, dtype: np.dtype) -> Any:
+    return [[(a[:, i, j].real.astype(dtype), a[:, i, j].imag.astype(dtype)) for j in (0, 1)] for i in (0, 1)]
+
+
+def _observed(problem: Problem, index: np.ndarray) -> Observed:
+    """The statistics of the pixels ``index``; products in double precision before they are rounded."""
+    s, dtype = problem.statistics, problem.dtype
+    r, y = (_elements(x[index], np.dtype(float)) for x in (s.illumination, s.response))
+    cast = lambda k: Pauli(*((re.astype(dtype), im.astype(dtype)) for re, im in k))  # noqa: E731
+    return Observed(
+        np.ones((), dtype),
+        cast(pauli(times_adjoint(y, r))),
+        cast(pauli(times_adjoint(r, r))),
+        _elements(s.illumination[index], dtype),
+        _elements(s.response[index], dtype),
+        s.residual[index].astype(dtype),
+        s.count[index].astype(dtype),
+    )
+
+
+def _point(problem: Problem, index: np.ndarray, chains: int, rng: np.random.Generator | None) -> Point:
+    """Chains at the fit's parameters, moved apart if there is a generator; ``(chains, pixels)``."""
+    values = []
+    for name in Parameters._fields:
+        value = np.broadcast_to(np.nan_to_num(problem.fit[name][index]), (chains, len(index)))
+        if rng is not None and problem.plan.fixed[Parameters._fields.index(name)] is None:
+            std = np.minimum(np.nan_to_num(problem.fit[f"std_{name}"][index]), 0.5)
+            value = value + SPREAD * std * rng.normal(size=value.shape)
+        values.append(value)
+    values[0] = np.clip(values[0], -0.999, 0.999)
+    if problem.plan.bounded:
+        values[2] = np.clip(values[2], -0.999 * np.pi, 0.999 * np.pi)
+    pairs = pairs_of(Parameters(*values), np.dtype(float))
+    for i, known in enumerate(problem.plan.fixed):
+        if known is not None:
+            pairs[2 * i], pairs[2 * i + 1] = known
+    pairs = pairs.astype(problem.dtype)
+    return Point(*((jnp.asarray(pairs[2 * i]), jnp.asarray(pairs[2 * i + 1])) for i in range(5)))
+
+
+def _inside(problem: Problem, index: np.ndarray, point: Point) -> Point:
+    """Where a prior forbids the moved start, the fit's own."""
+    unmoved = _point(problem, index, point[0][0].shape[0], None)
+    allowed: Any = True
+    for prior, pair in zip(problem.plan.prior, point, strict=True):
+        found = None if prior is None else prior.evaluate(pair)
+        if found is not None:
+            allowed = allowed & jnp.isfinite(found[0])
+    return jax.tree.map(lambda a, b: jnp.where(allowed, a, b), point, unmoved)
+
+
+def _start(problem: Problem, index: np.ndarray, chains: int, rng: np.random.Generator) -> State:
+    point = _inside(problem, index, _point(problem, index, chains, rng))
+    shape, dtype = (chains, len(index)), problem.dtype
+    gain = (np.ones(shape, dtype), np.zeros(shape, dtype))
+    if "gain" in problem.fit:
+        g = np.broadcast_to(problem.fit["gain"][index], shape)
+        if problem.plan.gain == "phase":
+            g = np.where(np.abs(g) > 0, g / np.maximum(np.abs(g), 1e-30), 1)
+        gain = (g.real.astype(dtype), g.imag.astype(dtype))
+    precision = np.ones(shape, dtype)
+    if problem.plan.noise != "known":
+        precision = np.broadcast_to(problem.fit["sigma"][index] ** -2.0, shape).astype(dtype)
+    return State(point, jax.tree.map(jnp.asarray, gain), jnp.asarray(precision))
+
+
+def _reference(problem: Problem, index: np.ndarray) -> Any:
+    """Cosines and sines of what :func:`kernel._aligned` compares, of the fit."""
+    value = {name: np.nan_to_num(problem.fit[name][index]) for name in Parameters._fields}
+    found: list[Any] = [jnp.asarray(value["diattenuation"], problem.dtype)]
+    for name, factor in zip(Parameters._fields[1:], FACTORS[1:], strict=True):
+        angle = value[name] * (1.0 if name == "retardance" else factor)
+        found.append(tuple(jnp.asarray(f(angle), problem.dtype) for f in (np.cos, np.sin)))
+    return tuple(found)
+
+
+class _Chains:
+    """Draws of all pixels, and the sums of their batches."""
+
+    def __init__(self, problem: Problem, chains: int, draws: int, pixels: int) -> None:
+        dtype = problem.dtype
+        self.parameters = np.empty((5, chains, draws, pixels), dtype)
+        self.gain = None
+        if problem.plan.gain != "unit":
+            self.gain = np.empty((chains, draws, pixels), np.result_type(dtype, np.complex64))
+        self.precision = None if problem.plan.noise == "known" else np.empty((chains, draws, pixels), dtype)
+        self.sums: np.ndarray | None = None
+        self.lengths = [min(BATCH, draws - begin) for begin in range(0, draws, BATCH)]
+
+    def store(self, number: int, take: Any, count: int, batch: kernel.Batch) -> None:
+        """Batch ``number`` of the pixels ``take``, of which ``count`` are meant."""
+        begin = number * BATCH
+        span = slice(begin, begin + self.lengths[number])
+        new = np.asarray(batch.parameters)[..., :count]
+        self.parameters[:, :, span, take] = np.moveaxis(new, (0, 1, 2), (2, 0, 1))
+        if self.gain is not None:
+            pair = np.asarray(batch.gain)[..., :count]  # (draws, 2, chains, pixels)
+            self.gain[:, span, take] = np.moveaxis(pair[:, 0] + 1j * pair[:, 1], 0, 1)
+        if self.precision is not None:
+            self.precision[:, span, take] = np.moveaxis(np.asarray(batch.precision)[..., :count], 0, 1)
+        assert self.sums is not None
+        self.sums[number][..., take] = np.asarray(batch.sums, float)[..., :count]
+
+
+def convergence(sums: np.ndarray, lengths: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Largest split R-hat and least effective draws over the invariants, (pixels).
+
+    ``sums`` ``(batches, 2, invariants, chains, pixels)`` of batches of so many draws. The effective number comes from
+    the variance of the batch means.
+    """
+    length = np.asarray(lengths, float)
+    full = length == length[0]
+    means = sums[full, 0] / length[0]
+    n = length[full].sum()
+    within = sums[full, 1].sum(0) / n - (sums[full, 0].sum(0) / n) ** 2  # (invariants, chains, pixels)
+    batches, chains = means.shape[0], means.shape[2]
+    half = max(batches // 2, 1)
+    halves = np.stack([means[:half].mean(0), means[-half:].mean(0)])  # (2, invariants, chains, pixels)
+    variance = np.maximum(within.mean(axis=1), 0)
+    spread = halves.swapaxes(0, 1).reshape(halves.shape[1], -1, halves.shape[-1]).var(axis=1, ddof=1)
+    size = half * length[0]
+    still = variance <= 1e-12 * np.max(variance, axis=0, initial=1e-30)  # what a fixed parameter makes constant
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r_hat = np.sqrt((size - 1) / size + spread / variance)
+        scatter = np.moveaxis(means, 1, 0).reshape(means.shape[1], -1, means.shape[-1])
+        total = scatter.var(axis=1, ddof=1) * length[0]
+        effective = chains * n * (variance + spread) / np.maximum(total, 1e-300)
+    r_hat = np.where(still, 1.0, r_hat)
+    effective = np.where(still, chains * n, np.minimum(effective, 2 * chains * n))
+    return r_hat.max(axis=0), effective.min(axis=0)
+
+
+def _run(
+    problem: Problem, store: _Chains, pixels: np.ndarray, numbers: np.ndarray, chains: int, sampler: Gibbs, thin: int,
+    seed: int, attempt: int, done: Callable[[int], Any],
+) -> None:  # fmt: skip
+    """Draw for the pixels with the places ``pixels`` and the numbers ``numbers`` in the frame."""
+    frame = problem.plan.noise == "frame"
+    size = len(pixels) if frame else BLOCKS[0] if len(pixels) <= BLOCKS[0] else BLOCKS[1]
+
+    def block(begin_at: int) -> None:
+        own = pixels[begin_at : begin_at + size]
+        count = len(own)
+        index = np.concatenate([own, np.full(size - count, own[0])])
+        stream = begin(seed, numbers[index], chains, 2 * attempt)
+        draws_start = np.random.default_rng([seed, 1, attempt, int(numbers[own[0]])])
+        data, reference = jax.tree.map(jnp.asarray, _observed(problem, index)), _reference(problem, index)
+        state = _start(problem, index, chains, draws_start)
+        centre_state = State(_point(problem, index, 1, None), state.gain, state.precision[:1])
+        centre = jnp.stack(
+            [jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, centre_state.point,
+                                                                           centre_state.precision)]
+        )  # fmt: skip
+        stream = jax.tree.map(jnp.asarray, stream)
+        run = (problem.plan, problem.balanced)
+        warm = -(-sampler.warmup // BATCH)
+        for number in range(-warm, len(store.lengths)):
+            state, stream, batch = kernel.advance(
+                *run, BATCH if number < 0 else store.lengths[number], thin, data, reference, centre, state, stream
+            )
+            if number >= 0:
+                store.store(number, own, count, batch)
+        done(count)
+
+    starts = range(0, len(pixels), size)
+    cores = os.cpu_count() or 1
+    if len(starts) == 1 or cores == 1:
+        for at in starts:
+            block(at)
+        return
+    with ThreadPoolExecutor(min(cores, 8)) as pool:
+        list(pool.map(block, starts))
+
+
+def draw_gibbs(
+    model: Model, measurement: Measurement, fit: Fit, good: np.ndarray, sampler: Gibbs, chains: int, draws: int,
+    seed: int, done: Callable[[int], Any] = lambda _: None,
+) -> Raw:  # fmt: skip
+    """Draws of the pixels with the flat numbers ``good``.
+
+    Raises
+    ------
+    ValueError: a model whose conditional distributions are not known.
+    """
+    known = plan(model)
+    if isinstance(known, str):
+        raise ValueError(f"model: the Gibbs sampler cannot draw from it, because {known}; use sampler=Ensemble().")
+    problem = _problem(known, model, measurement, fit, good)
+    store = _Chains(problem, chains, draws, len(good))
+    invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1, None), jnp.ones((1, 1))))
+    store.sums = np.zeros((len(store.lengths), 2, invariants, chains, len(good)))
+    pixels = np.arange(len(good))
+    for attempt, more in enumerate((1, *MORE)):
+        _run(problem, store, pixels, good, chains, sampler, sampler.thin * more, seed, attempt, done)
+        if known.noise == "frame":
+            break
+        r_hat, effective = convergence(store.sums[..., pixels], store.lengths)
+        # few draws cannot reach the number asked for, and their R-hat scatters
+        enough = min(sampler.effective, 0.2 * chains * draws)
+        pixels = pixels[(r_hat > LARGEST_R + 2 / np.sqrt(chains * draws)) | (effective < enough)]
+        if len(pixels) == 0:
+            break
+    converged = np.ones(len(good), bool)
+    r_hat, effective = convergence(store.sums, store.lengths)
+    enough = min(sampler.effective, 0.2 * chains * draws)
+    converged = (r_hat <= LARGEST_R + 2 / np.sqrt(chains * draws)) & (effective >= enough)
+    nothing = np.full(len(good), np.nan)
+    sigma = None if store.precision is None else store.precision**-0.5
+    return Raw(Parameters(*store.parameters), store.gain, sigma, nothing, nothing.copy(), converged)

@@ -1,0 +1,115 @@
+"""The compiled code: from a state to the next draws of a block of pixels, with what the diagnostics need."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ...fitting.fast.point import Point
+from ...fitting.fast.priors import FACTORS
+from ...records import PERIODS, Parameters
+from .plan import Plan
+from .random import Random, Stream
+from .sweep import Observed, State, sweep
+
+__all__ = ["Batch", "advance", "invariants"]
+
+
+class Batch(NamedTuple):
+    """Consecutive draws ``(draws, 5, chains, pixels)``, of the gain and of ``1 / sigma^2`` ``(draws, chains, pixels)``.
+
+    The last two are None where there is nothing to infer. ``sums`` of the invariants less a constant and of their
+    squares, ``(2, invariants, chains, pixels)``.
+    """
+
+    parameters: Any
+    gain: Any
+    precision: Any
+    sums: Any
+
+
+def invariants(plan: Plan, point: Point, precision: Any) -> list[Any]:
+    """Functions of a state that are the same for all parameter sets of one matrix."""
+    (c0, s0), (c1, s1), (c2, s2), (c3, s3), (c4, s4) = point
+    d = 2 * s0 * c0
+    found = [jnp.abs(d), d * c1, d * s1] if {0, 1} & set(plan.free) else []
+    if {2, 3, 4} & set(plan.free):
+        q = [c2, s2 * c3, s2 * s3 * c4, s2 * s3 * s4]
+        if plan.bounded:
+            found += q
+        else:  # the other sign of q is the other sign of the gain
+            found += [q[i] * q[j] for i in range(4) for j in range(i, 4) if (i, j) != (3, 3)]
+    if plan.noise != "known":
+        found.append(jnp.log(precision))
+    return found
+
+
+def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
+    """Parameters of the copy nearest to a reference (cosines and sines of the parameters), and the sign of the gain."""
+    (c0, s0), (x, y), (c2, s2), (c3, s3), (c4, s4) = point
+    sign = jnp.ones_like(c2)
+    if not plan.bounded:
+        sign = jnp.where(c2 < 0, -1, 1).astype(c2.dtype)
+        c2, s2 = sign * c2, sign * s2
+    d = 2 * s0 * c0
+    d_ref, (cx, sx), (ce, se), (ct, st), (cc, sc) = reference
+    movable = set(plan.free)
+    if movable >= {0, 1}:
+        other = d * d_ref + (x * cx + y * sx) < 0  # half the difference of the squared distances
+        flip = jnp.where(other, -1, 1).astype(d.dtype)
+        d, x, y = flip * d, flip * x, flip * y
+    if movable >= {2, 3, 4}:
+        # eta = 2 y2: its sine; cosines of the differences, axes count by their doubled angle
+        sine = 2 * c2 * s2
+        along, across = c3 * ct, s3 * st
+        turn = c4 * cc + s4 * sc
+        cosine_part = (c2 * c2 - s2 * s2) * ce
+        best: Any = -jnp.inf
+        a: Any = jnp.ones_like(sine)
+        b: Any = a
+        for f in (1, -1):
+            for g in (1, -1):
+                value = cosine_part + f * sine * se + f * along + f * g * across + g * turn
+                better = value > best
+                best = jnp.where(better, value, best)
+                a, b = jnp.where(better, f, a), jnp.where(better, g, b)
+        s2, c3, s3 = a * s2, a * c3, a * b * s3
+        c4, s4 = b * c4, b * s4
+    pairs = ((x, y), (c2, s2), (c3, s3), (c4, s4))
+    found = [jnp.clip(d, -1, 1)]
+    for name, (c, s) in zip(Parameters._fields[1:], pairs, strict=True):
+        half = 0.5 * getattr(PERIODS, name)
+        found.append(jnp.clip(jnp.arctan2(s, c) / getattr(FACTORS, name), -half, half))
+    return jnp.stack([jnp.broadcast_to(x, found[0].shape) for x in found]), sign
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def advance(
+    plan: Plan, balanced: bool, draws: int, thin: Any, data: Observed, reference: Any, centre: Any, state: State,
+    stream: Stream,
+) -> tuple[State, Stream, Batch]:  # fmt: skip
+    """``draws`` draws, ``thin`` sweeps apart; ``centre`` (invariants, pixels) is taken off the invariants."""
+    dtype = data.residual.dtype
+
+    def one(_: Any, carry: Any) -> Any:
+        state, stream = carry
+        random = Random(stream, dtype)
+        state = sweep(plan, balanced, data, state, random)
+        return state, random.stream
+
+    def step(carry: Any, _: Any) -> Any:
+        state, stream, sums = carry
+        state, stream = jax.lax.fori_loop(0, thin, one, (state, stream))
+        found, shape = invariants(plan, state.point, state.precision), state.precision.shape
+        off = jnp.stack([jnp.broadcast_to(x, shape) - c for x, c in zip(found, centre, strict=True)])
+        parameters, sign = _aligned(plan, reference, state.point)
+        gain = None if plan.gain == "unit" else jnp.stack([sign * state.gain[0], sign * state.gain[1]])
+        precision = None if plan.noise == "known" else state.precision
+        return (state, stream, sums + jnp.stack([off, off * off])), (parameters, gain, precision)
+
+    zero = jnp.zeros((2, len(centre), *state.precision.shape), dtype)
+    (state, stream, sums), (parameters, gain, precision) = jax.lax.scan(step, (state, stream, zero), None, length=draws)
+    return state, stream, Batch(parameters, gain, precision, sums)

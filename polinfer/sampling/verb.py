@@ -1,0 +1,137 @@
+"""The verb ``sample``: which sampler draws, and the draws put back into the frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..checks import as_generator, integer, one_of_types
+from ..degeneracy import nearest, orbit
+from ..fitting import fit
+from ..model import Model
+from ..records import Fit, Measurement, Parameters, Status
+from .draws import Draws
+from .ensemble import Ensemble, draw_ensemble
+from .gibbs import Gibbs, draw_gibbs
+from .raw import Raw
+
+__all__ = ["sample"]
+
+LEAST = 4  # draws of a chain
+# of a fit, what remains true of draws
+KEPT = Status.MASKED | Status.NON_FINITE | Status.BAD_FIT | Status.AT_EDGE
+
+
+def sample(
+    model: Model,
+    measurement: Measurement,
+    sampler: Gibbs | Ensemble | None = None,
+    chains: int = 4,
+    draws: int = 1000,
+    rng: int | np.random.Generator | None = None,
+    progress: bool = False,
+) -> Draws:
+    """Draws from the posterior of every pixel.
+
+    The density is ``p(parameters | data)``, in D, theta_D, eta, theta_eta, xi (radians), with gain and noise drawn
+    along where they are unknown. Chains start around the most probable parameters. Of the eight equivalent parameter
+    sets each draw is the one that is nearest to the most probable parameters of its pixel.
+
+    Parameters
+    ----------
+    model: the scene. measurement: the data, pixel shape P.
+    sampler: :class:`Gibbs` (None: with its default settings), all pixels at once, or :class:`Ensemble`, any model, one
+        pixel after the other.
+    chains: independent chains (ensembles) of each pixel, >= 1; four show whether they agree.
+    draws: draws that are kept of each chain, >= 4.
+    rng: seed, generator, or None: a fresh seed. It is recorded. A pixel's random numbers depend on the seed and on its
+        place in the frame only.
+    progress: show a progress bar.
+
+    Returns
+    -------
+    Draws, parameters of shape ``(chain, draw, *P)``. ``status`` holds NOT_CONVERGED where the chains do not agree after
+    all further sweeps, BAD_FIT and AT_EDGE from the most probable parameters, and UNIDENTIFIED flags from
+    the fit; :meth:`Draws.summary` sets the latter anew from the draws.
+
+    Raises
+    ------
+    ValueError: a model that the sampler cannot draw from, numbers out of range; as :func:`polinfer.fit` otherwise.
+    TypeError: arguments of a wrong kind.
+
+    Source: conditional distributions, ``docs/theory-inference.md``; ensembles, Foreman-Mackey et al., PASP 125, 306
+    (2013).
+
+    >>> import polinfer
+    >>> truth = polinfer.Parameters(0.3, 0.5, 1.2, 0.4, 0.2)
+    >>> states = np.array([[1, 1, 1], [1, 1j, -1]]) / 2**0.5
+    >>> data = polinfer.simulate(polinfer.Model(), truth, states, sigma=0.01, rng=1)
+    >>> found = sample(polinfer.Model(), data, draws=200, rng=1)
+    >>> found.parameters.retardance.shape, bool(abs(found.summary().mean.retardance - 1.2) < 0.05)
+    ((4, 200), True)
+    """
+    one_of_types("model", model, (Model,), "pass Model(...).")
+    one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
+    sampler = Gibbs() if sampler is None else sampler
+    one_of_types("sampler", sampler, (Gibbs, Ensemble), "pass Gibbs(...) or Ensemble(...).")
+    chains, draws = integer("chains", chains, low=1), integer("draws", draws, low=LEAST)
+    generator, seed = as_generator(rng)
+    if seed is None:
+        seed = int(generator.integers(1 << 62))
+    found = fit(model, measurement)
+    good = np.flatnonzero(np.ravel(found.status & int(Status.MASKED | Status.NON_FINITE)) == 0)
+    if isinstance(sampler, Gibbs):
+        raw = _with_bar(model, measurement, found, good, sampler, chains, draws, seed, progress)
+    else:
+        raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good)
+        raw = raw._replace(parameters=_aligned(raw.parameters, found, good))
+    return _assemble(model, measurement, found, good, raw, sampler, seed)
+
+
+def _with_bar(
+    model: Model, measurement: Measurement, found: Fit, good: np.ndarray, sampler: Gibbs, chains: int, draws: int,
+    seed: int, progress: bool,
+) -> Raw:  # fmt: skip
+    from tqdm import tqdm
+
+    with tqdm(total=len(good), desc="sample", unit="pixel", disable=not progress) as bar:
+        return draw_gibbs(model, measurement, found, good, sampler, chains, draws, seed, bar.update)
+
+
+def _aligned(parameters: Parameters, found: Fit, good: np.ndarray) -> Parameters:
+    """Of the copies of every draw the one nearest to the fit; what is fixed or drops out does not move."""
+    reference = Parameters(*(np.nan_to_num(np.asarray(x, float).reshape(-1)[good]) for x in found.parameters))
+    given = Parameters(*(np.nan_to_num(np.asarray(x, float)) for x in parameters))
+    if found.model.fixed:
+        return given
+    return nearest(orbit(given), reference)
+
+
+def _assemble(
+    model: Model, measurement: Measurement, found: Fit, good: np.ndarray, raw: Raw, sampler: Any, seed: int
+) -> Draws:
+    shape, pixels = measurement.shape, int(np.prod(measurement.shape))
+
+    def spread(values: np.ndarray | None, dtype: Any = None) -> Any:
+        if values is None:
+            return None
+        lead = values.shape[:-1]
+        if len(good) == pixels:
+            frame = np.asarray(values, dtype)
+        else:
+            frame = np.full((*lead, pixels), np.nan, dtype or values.dtype)
+            frame[..., good] = values
+        return frame.reshape((*lead, *shape))
+
+    values = {name: spread(getattr(raw.parameters, name)) for name in Parameters._fields}
+    for name in model.dropped:
+        values[name] = np.full_like(values[name], np.nan)
+    status = np.ravel(found.status & int(KEPT)).astype(np.int32)
+    for name in Parameters._fields:
+        status |= np.ravel(found.status).astype(np.int32) & int(Status.unidentified(name))
+    status[good] |= np.where(raw.converged, 0, int(Status.NOT_CONVERGED)).astype(np.int32)
+    return Draws(
+        model, measurement, Parameters(**values), spread(raw.log_evidence), spread(raw.log_evidence_error),
+        status.reshape(shape), spread(raw.gain), spread(raw.sigma), seed, sampler,
+    )  # fmt: skip

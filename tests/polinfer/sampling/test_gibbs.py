@@ -1,0 +1,158 @@
+"""Draws of the Gibbs sampler against weighted draws from the prior, which share nothing with it but the density."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from polinfer import (
+    AxialVonMises,
+    ComplexGain,
+    Ensemble,
+    Gibbs,
+    InferredNoise,
+    Measurement,
+    Model,
+    Ordering,
+    Parameters,
+    PhaseGain,
+    PolariserFirst,
+    RetarderFirst,
+    Status,
+    TruncatedNormal,
+    VonMises,
+    Window,
+    fit,
+    sample,
+    simulate,
+)  # fmt: skip
+from polinfer.sampling.invariants import invariants
+
+from ..scenes import BALANCED, UNBALANCED
+
+COPIES, PRIOR_DRAWS = 48, 1_000_000
+PRIORS = {
+    "diattenuation": TruncatedNormal(0.3, 0.4, -1, 1),
+    "retardance": VonMises(1.0, 2.0),
+    "retardance_angle": AxialVonMises(0.3, 1.5),
+    "circularity": AxialVonMises(0.5, 1.0),
+}
+# every kind of conditional at least once; more combinations: python -m benchmarks calibration
+CASES = {
+    "unit gain": (Model(), BALANCED, 0.5),
+    "second harmonics": (Model(), UNBALANCED, 0.6),
+    "complex gain": (Model(PolariserFirst(), gain=ComplexGain(0.8)), BALANCED, 0.4),
+    "priors, phase": (Model(priors=PRIORS, gain=PhaseGain()), UNBALANCED, 0.6),
+    "sigma of every pixel": (Model(noise=InferredNoise(2.0, 0.3, "pixel")), BALANCED, 0.4),
+    "one state": (Model(priors=PRIORS), np.array([[1.0], [0.4j]]), 0.5),
+}
+
+
+def prior_draws(model: Model, count: int, rng: np.random.Generator) -> Parameters:
+    return Parameters(*(model.priors[name].sample(rng, (count,)) for name in Parameters._fields))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_means_of_invariants(name):
+    model, states, sigma = CASES[name]
+    rng = np.random.default_rng(11)
+    truth = Parameters(*(np.full(COPIES, x[0]) for x in prior_draws(Model(), 1, rng)))
+    one = simulate(Model(model.ordering), Parameters(*(x[:1] for x in truth)), states, sigma, rng=3)
+    known = model.noise.sigma(one) is not None if not isinstance(model.noise, InferredNoise) else False
+    # the same data in every pixel: independent runs
+    data = Measurement(states, np.repeat(one.response, COPIES, axis=0), sigma if known else None)
+    draws = sample(model, data, Gibbs(evidence=False), draws=500, rng=5)
+    assert not np.any(draws.status & int(Status.NOT_CONVERGED))
+    ours = np.stack([np.asarray(x) for x in invariants(model, draws.parameters).values()]).mean(axis=(1, 2))
+    points = prior_draws(model, PRIOR_DRAWS, rng)
+    small = Measurement(states, one.response, sigma if known else None)
+    log_weight = np.asarray(model.log_likelihood(points, small), float)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    values = np.stack([np.asarray(x) for x in invariants(model, points).values()])
+    mean = values @ weight
+    error = np.sqrt((values - mean[:, None]) ** 2 @ weight**2)
+    assert 1 / np.sum(weight**2) > 2000
+    z = (ours.mean(axis=1) - mean) / np.hypot(ours.std(axis=1, ddof=1) / COPIES**0.5, error)
+    # ten or so correlated numbers; 4.5 sigma
+    assert np.abs(z).max() < 4.5
+
+
+def test_draws_of_gain_and_sigma_belong_to_the_draws_of_the_parameters():
+    model = Model(noise=InferredNoise(3.0, 0.02, "pixel"), gain=ComplexGain(1.0))
+    truth = Parameters(*(np.full(16, x) for x in (0.3, 0.5, 1.2, 0.4, 0.2)))
+    data = simulate(model, truth, BALANCED, 0.05, rng=1, gain=0.6 - 0.5j)
+    draws = sample(model, replace(data, sigma=None), Gibbs(evidence=False), draws=400, rng=2)
+    assert draws.gain is not None
+    assert draws.sigma is not None
+    off = draws.gain - (0.6 - 0.5j)
+    assert np.abs(off.mean()) < 0.05
+    assert np.abs(off).mean() > 0.01
+    # given the rest, (scale + Q) / sigma^2 is a gamma variate of shape 3 + 6, whatever Q is
+    matrices = np.asarray(model.jones(draws.parameters)) @ BALANCED
+    square = np.sum(np.abs(draws.gain[..., None, None] * matrices - data.response) ** 2, axis=(-1, -2))
+    assert abs(np.mean((0.02 + square) / draws.sigma**2) - 9) < 0.15
+
+
+def test_one_sigma_of_the_frame():
+    rng = np.random.default_rng(4)
+    truth = prior_draws(Model(), 60, rng)
+    data = simulate(Model(), truth, BALANCED, 0.1, rng=2)
+    model = Model(noise=InferredNoise(2.0, 0.01, "frame"))
+    draws = sample(model, replace(data, sigma=None), Gibbs(evidence=False), draws=300, rng=1)
+    assert draws.sigma is not None
+    assert np.ptp(draws.sigma, axis=-1).max() == 0
+    sigma = draws.sigma[..., 0]
+    # 60 pixels of 12 real data less five parameters: 2 n sigma^2 is known to sqrt(2 / 420)
+    assert abs(sigma.mean() - 0.1) < 4 * 0.1 * (0.5 / 420) ** 0.5
+    assert 0.8 < sigma.std() / (0.1 * (0.5 / 420) ** 0.5) < 1.25
+
+
+def test_a_pixel_does_not_depend_on_the_rest_of_the_frame_and_a_window_is_taken():
+    rng = np.random.default_rng(8)
+    truth = Parameters(*(x.reshape(4, 5) for x in prior_draws(Model(), 20, rng)))
+    data = simulate(Model(), truth, BALANCED, 0.05, rng=2)
+    mask = np.ones((4, 5), bool)
+    mask[:2] = False
+    whole = sample(Model(), data, Gibbs(evidence=False), draws=25, rng=3)
+    part = sample(Model(), replace(data, mask=mask), Gibbs(evidence=False), draws=25, rng=3)
+    assert np.all(part.status[:2] == int(Status.MASKED))
+    assert np.isnan(part.parameters.retardance[:, :, :2]).all()
+    np.testing.assert_allclose(part.parameters.retardance[0, 0, 2:], whole.parameters.retardance[0, 0, 2:], atol=1e-9)
+    same = Parameters(*(np.full((4, 5), x) for x in (0.3, 0.5, 1.2, 0.4, 0.2)))
+    even = simulate(Model(), same, BALANCED, 0.05, rng=2)
+    shared = sample(Model(neighbours=Window(3, 3)), even, Gibbs(evidence=False), draws=200, rng=3)
+    alone = sample(Model(), even, Gibbs(evidence=False), draws=200, rng=3)
+    ratio = shared.summary().std.retardance[1:3, 1:4] / alone.summary().std.retardance[1:3, 1:4]
+    np.testing.assert_allclose(ratio, 1 / 3, rtol=0.25)
+
+
+def test_every_draw_is_the_copy_nearest_to_the_fit():
+    rng = np.random.default_rng(8)
+    data = simulate(Model(), prior_draws(Model(), 64, rng), BALANCED, 0.02, rng=2)
+    found, draws = fit(Model(), data), sample(Model(), data, Gibbs(evidence=False), draws=50, rng=1)
+    sure = (found.status == 0) & (np.stack(list(found.std)).max(axis=0) < 0.05)
+    assert sure.sum() > 15
+    for name, period in zip(Parameters._fields, (np.inf, np.pi, 2 * np.pi, np.pi, 2 * np.pi), strict=True):
+        off = (getattr(draws.parameters, name) - getattr(found.parameters, name))[..., sure]
+        if np.isfinite(period):
+            off = off - period * np.round(off / period)
+        assert np.abs(off / getattr(found.std, name)[sure]).max() < 7
+
+
+class Third(RetarderFirst):
+    """An ordering of a user's own."""
+
+
+def test_what_it_cannot_draw_from_is_named():
+    data = simulate(Model(), Parameters(0.3, 0.5, 1.2, 0.4, 0.2), BALANCED, 0.05, rng=2)
+    assert issubclass(Third, Ordering)
+    with pytest.raises(ValueError, match="ordering Third are not known; use sampler=Ensemble"):
+        sample(Model(Third()), data)
+    with pytest.raises(ValueError, match="draws must be"):
+        sample(Model(), data, draws=2)
+    with pytest.raises(TypeError, match="sampler must be"):
+        sample(Model(), data, sampler="gibbs")
+    assert Ensemble().walkers == 32

@@ -1,0 +1,132 @@
+"""The one-dimensional steps of the sweep against distribution functions of other making."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import gamma as gamma_distribution
+from scipy.stats import kstest, norm, vonmises
+
+from polinfer.sampling.gibbs import circle
+from polinfer.sampling.gibbs.random import Random, begin
+
+LANES, STEPS = 4000, 40
+LEAST = 1e-4  # probability below which a test of a fixed seed objects
+
+
+def run(step, start, dtype, seed):
+    """The last of so many steps of every lane, all begun at one place."""
+
+    @jax.jit
+    def advance(stream):
+        def one(_, carry):
+            stream, old = carry
+            random = Random(stream, dtype)
+            new = step(random, old)
+            return random.stream, new
+
+        first = jax.tree.map(lambda x: jnp.full((1, LANES), x, dtype), start)
+        return jax.lax.fori_loop(0, STEPS, one, (stream, first))[1]
+
+    return jax.tree.map(lambda x: np.asarray(x, float)[0], advance(begin(seed, np.arange(LANES), 1)))
+
+
+def angles(pair):
+    assert np.abs(np.hypot(*pair) - 1).max() < 1e-5
+    return np.arctan2(pair[1], pair[0])
+
+
+def numerical(log_density, low, high):
+    """Distribution function of a density on an interval, by the trapezoidal rule."""
+    grid = np.linspace(low, high, 200_001)
+    density = np.exp(log_density(grid) - np.max(log_density(grid)))
+    total = np.concatenate([[0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
+    return lambda x: np.interp(x, grid, total / total[-1])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("concentration", [0.0, 0.3, 3.0, 400.0, 1e8])
+def test_von_mises(dtype, concentration):
+    b, c = (dtype(concentration * x) for x in (np.cos(2.0), np.sin(2.0)))
+    step = partial(circle.von_mises, b=jnp.full((1, LANES), b), c=jnp.full((1, LANES), c))
+    found = angles(run(lambda random, old: step(random, old=old), (1.0, 0.0), dtype, 1))
+    # about the mean: a single precision angle near 2 is known to 1e-7 only, a tenth of a percent of the width at 1e8
+    off = np.remainder(found - 2.0 + np.pi, 2 * np.pi) - np.pi
+    if concentration == 0:
+        assert kstest(off, "uniform", (-np.pi, 2 * np.pi)).pvalue > LEAST
+    elif concentration > 1e6:
+        assert kstest(off * concentration**0.5, norm.cdf).pvalue > LEAST
+    else:
+        assert kstest(off, vonmises(concentration).cdf).pvalue > LEAST
+
+
+@pytest.mark.parametrize(("b", "c"), [(0.0, 0.0), (3.0, 2.0), (-3.0, 5.0), (-0.5, -0.3), (-40.0, 900.0), (200.0, -1e4)])
+def test_half_circle(b, c):
+    step = partial(circle.half_circle, b=jnp.full((1, LANES), b), c=jnp.full((1, LANES), c))
+    found = angles(run(lambda random, old: step(random, old=old), (1.0, 0.0), float, 2))
+    cdf = numerical(lambda y: b * np.cos(y) + c * np.sin(y), -np.pi / 2, np.pi / 2)
+    assert kstest(found, cdf).pvalue > LEAST
+
+
+CASES = [
+    (0.0, 0.0, 0.0, 0.0), (5.0, 1.0, 0.3, 4.0), (900.0, 100.0, 0.0, 4.0), (800.0, 780.0, 0.0, 4.0),
+    (500.0, 900.0, 0.0, 4.0), (-3.0, 1.0, 2.0, 0.0), (50.0, -45.0, -6.0, 25.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("b", "c", "linear", "square"), CASES)
+def test_diattenuation(b, c, linear, square):
+    given = [jnp.full((1, LANES), x) for x in (b, c, linear, square)]
+    found = angles(run(lambda random, old: circle.diattenuation(random, *given, old), (1.0, 0.0), float, 3))
+
+    def log_density(y):
+        d = np.sin(2 * y)
+        with np.errstate(divide="ignore"):
+            edge = np.log(np.maximum(np.cos(2 * y), 0))
+        return b * np.cos(y) + c * np.sin(y) + linear * d - 0.5 * square * d * d + edge
+
+    assert kstest(found, numerical(log_density, -np.pi / 4, np.pi / 4)).pvalue > LEAST
+
+
+def test_slices_of_a_density_with_two_peaks():
+    def log_density(pair):
+        double = pair[0] ** 2 - pair[1] ** 2
+        return 1.5 * double + 0.5 * pair[1]
+
+    found = angles(run(lambda random, old: circle.slice_step(random, log_density, 4.0, old), (1.0, 0.0), float, 4))
+    cdf = numerical(lambda y: 1.5 * np.cos(2 * y) + 0.5 * np.sin(y), -np.pi, np.pi)
+    assert kstest(found, cdf).pvalue > LEAST
+
+
+@pytest.mark.parametrize("shape", [1.0, 4.5, 3000.0])
+def test_gamma(shape):
+    found = run(lambda random, old: random.gamma(jnp.full((1, LANES), shape), old), shape, float, 5)
+    assert kstest(found, gamma_distribution(shape).cdf).pvalue > LEAST
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_words_are_uniform_and_lanes_unrelated(dtype):
+    stream, rows = begin(9, np.arange(LANES), 1), []
+    for _ in range(8):
+        random = Random(stream, dtype)
+        rows.append(np.asarray(random.uniform(), float)[0])
+        stream = random.stream
+    values = np.stack(rows)
+    assert 0 < values.min() < values.max() < 1
+    assert kstest(values.ravel(), "uniform").pvalue > LEAST
+    correlation = np.corrcoef(values) - np.eye(8)
+    assert np.abs(correlation).max() < 5 / LANES**0.5
+    assert abs(np.corrcoef(values[:, :-1].ravel(), values[:, 1:].ravel())[0, 1]) < 5 / (8 * LANES) ** 0.5
+
+
+def test_streams_depend_on_seed_pixel_chain_and_purpose_only():
+    whole, part = begin(3, np.arange(10), 2), begin(3, np.array([4, 7]), 2)
+    for a, b in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(a[:, [4, 7]], b)
+    assert len(np.unique(whole[0])) == 20
+    for other in (begin(4, np.arange(10), 2), begin(3, np.arange(10), 2, purpose=1)):
+        assert not np.any(whole[0] == other[0])
