@@ -25,6 +25,7 @@ from ...records import Fit, Measurement, Parameters
 from ...statistics import Statistics
 from ..raw import Raw
 from . import kernel
+from .evidence import MOST_DRAWS, Given, log_evidence, unavailable
 from .plan import Plan, plan
 from .random import begin
 from .sampler import Gibbs
@@ -36,6 +37,7 @@ BLOCKS = (64, 512)  # numbers of pixels for which code is compiled
 BATCH = 25  # draws between two looks at the clock, and the length of the batches of the diagnostics
 MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
+EVIDENCE_BLOCK = 32  # pixels
 SPREAD = 1.5  # standard deviations by which the chains are moved apart at the start
 
 
@@ -239,14 +241,44 @@ def _run(
                 store.store(number, own, count, batch)
         done(count)
 
-    starts = range(0, len(pixels), size)
+    _each(block, range(0, len(pixels), size))
+
+
+def _each(work: Callable[[int], None], items: range) -> None:
+    """On all cores; compiled code and large NumPy operations release the lock."""
     cores = os.cpu_count() or 1
-    if len(starts) == 1 or cores == 1:
-        for at in starts:
-            block(at)
+    if len(items) == 1 or cores == 1:
+        for item in items:
+            work(item)
         return
     with ThreadPoolExecutor(min(cores, 8)) as pool:
-        list(pool.map(block, starts))
+        list(pool.map(work, items))
+
+
+def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
+    """Log evidence and its standard error, (2, pixels)."""
+    found = np.empty((2, len(good)))
+    _, chains, draws, _ = store.parameters.shape
+    factors = np.array([0.5, 2.0, 1.0])[:, None, None, None]
+    kept = np.linspace(0, draws - 1, max(min(draws, MOST_DRAWS // chains) // 10 * 10, min(draws, 10))).astype(int)
+
+    def block(begin_at: int) -> None:
+        index = np.arange(begin_at, min(begin_at + EVIDENCE_BLOCK, len(good)))
+        double = problem._replace(dtype=np.dtype(float))
+        observed = _observed(double, index)
+        fit = [np.nan_to_num(problem.fit[name][index]) for name in Parameters._fields]
+        point = np.stack([0.5 * np.arcsin(np.clip(fit[0], -1, 1)), 2 * fit[1], 0.5 * fit[2], 2 * fit[3], fit[4]])
+        power = np.sum(np.abs(problem.statistics.response[index]) ** 2, axis=(-1, -2))
+        retarder = store.parameters[2:, :, kept][..., index].astype(float) * factors
+        gain = None if store.gain is None else store.gain[:, kept][..., index].reshape(-1, len(index))
+        given = Given(
+            observed.product, observed.power, problem.balanced, point, problem.statistics.constant[index] - power,
+            retarder.reshape(3, -1, len(index)), gain, chains,
+        )  # fmt: skip
+        found[:, index] = log_evidence(problem.plan, given)
+
+    _each(block, range(0, len(good), EVIDENCE_BLOCK))
+    return found
 
 
 def draw_gibbs(
@@ -281,6 +313,8 @@ def draw_gibbs(
     r_hat, effective = convergence(store.sums, store.lengths)
     enough = min(sampler.effective, 0.2 * chains * draws)
     converged = (r_hat <= LARGEST_R + 2 / np.sqrt(chains * draws)) & (effective >= enough)
-    nothing = np.full(len(good), np.nan)
+    evidence = np.full((2, len(good)), np.nan)
+    if sampler.evidence and unavailable(known) is None:
+        evidence = _evidence(problem, store, good)
     sigma = None if store.precision is None else store.precision**-0.5
-    return Raw(Parameters(*store.parameters), store.gain, sigma, nothing, nothing.copy(), converged)
+    return Raw(Parameters(*store.parameters), store.gain, sigma, evidence[0], evidence[1], converged)
