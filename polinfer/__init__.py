@@ -15,7 +15,7 @@ from .noise import InferredNoise, KnownNoise
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .priors import AxialVonMises, Prior, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters, Status
-from .sampling import Draws, Ensemble, Gibbs, sample
+from .sampling import Draws, Ensemble, Gibbs, calibration_ranks, sample
 from .simulation import simulate
 from .storage import save
 
@@ -42,6 +42,7 @@ __all__ = [
     "UniformAngle",
     "VonMises",
     "Window",
+    "calibration_ranks",
     "canonicalise",
     "compare",
     "conventions",

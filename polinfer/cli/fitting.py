@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .options import PATH, declared_model, model_options, overwrite_option, vacant
+from .options import PATH, declared_model, measurement_of, model_options, overwrite_option, vacant
 
 __all__ = ["fit_command"]
 
@@ -53,24 +53,17 @@ def fit_command(
 
     Example: polinfer fit measurement.nc result.nc --window 3 5 --fix diattenuation=0
     """
-    from dataclasses import replace
-
     import numpy as np
 
-    from .. import files, storage
+    from .. import storage
     from ..fitting import fit
-    from ..records import PERIODS, Measurement, Parameters, Status
+    from ..records import PERIODS, Parameters, Status
 
     if picture is None and (smooth is not None or pixel_size is not None):
         raise click.UsageError("the gauge and --pixel-size are only for --picture.")
     model = declared_model(**declared)
     vacant(out, overwrite)
-    data = files.load(measurement)
-    if not isinstance(data, Measurement):
-        raise click.UsageError(f"{measurement} holds a {type(data).__name__}, not a Measurement.")
-    if declared["infer_noise"] is not None and data.sigma is not None:
-        click.echo("the sigma of the measurement is not used: --infer-noise")
-        data = replace(data, sigma=None)
+    data = measurement_of(measurement, declared)
     result = fit(model, data, progress=progress)
     storage.save(result, out, overwrite=overwrite)
     if picture is not None:

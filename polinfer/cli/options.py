@@ -11,8 +11,18 @@ import click
 if TYPE_CHECKING:
     from ..model import Model
     from ..orderings import Ordering
+    from ..records import Measurement
 
-__all__ = ["PATH", "declared_model", "model_options", "named_ordering", "ordering_option", "overwrite_option", "vacant"]
+__all__ = [
+    "PATH",
+    "declared_model",
+    "measurement_of",
+    "model_options",
+    "named_ordering",
+    "ordering_option",
+    "overwrite_option",
+    "vacant",
+]
 
 PATH = click.Path(path_type=Path)
 
@@ -146,3 +156,19 @@ def vacant(path: Path, overwrite: bool) -> None:
     """Refuse to write over a file before the work is done, not after it."""
     if path.exists() and not overwrite:
         raise click.UsageError(f"{path} exists; choose another name or pass --overwrite.")
+
+
+def measurement_of(path: Path, declared: dict[str, Any]) -> Measurement:
+    """The measurement in a file, without its sigma where that is to be inferred."""
+    from dataclasses import replace
+
+    from .. import files
+    from ..records import Measurement
+
+    data = files.load(path)
+    if not isinstance(data, Measurement):
+        raise click.UsageError(f"{path} holds a {type(data).__name__}, not a Measurement.")
+    if declared["infer_noise"] is not None and data.sigma is not None:
+        click.echo("the sigma of the measurement is not used: --infer-noise")
+        data = replace(data, sigma=None)
+    return data

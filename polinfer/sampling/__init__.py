@@ -1,5 +1,6 @@
 """Full posteriors: samplers, their draws, and what is to be said about them."""
 
+from .calibration import Ranks, calibration_ranks
 from .diagnostics import Diagnostics
 from .draws import Draws
 from .ensemble import Ensemble
@@ -8,4 +9,4 @@ from .predictive import Predictive
 from .summaries import Summary
 from .verb import sample
 
-__all__ = ["Diagnostics", "Draws", "Ensemble", "Gibbs", "Predictive", "Summary", "sample"]
+__all__ = ["Diagnostics", "Draws", "Ensemble", "Gibbs", "Predictive", "Ranks", "Summary", "calibration_ranks", "sample"]

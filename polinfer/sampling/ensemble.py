@@ -122,8 +122,8 @@ def draw_ensemble(
     they do not depend on the other pixels. With neighbours the parameters are those of the window around each pixel;
     gain and sigma are those of the pixel itself, drawn given the parameters (None where the model has none to infer).
     ``converged``: of every coordinate, split R-hat is below 1.05, there are at least 100 effective draws, and the
-    records are five autocorrelation times of a walker long. Then the evidence comes from bridge sampling between the
-    second half of the records and a mixture fitted to the first; else it is NaN, as its error could not be trusted.
+    records are five autocorrelation times of a walker long. Then the evidence comes from bridge sampling, each
+    half of the ensembles with a mixture fitted to the other half; else it is NaN, as its error could not be trusted.
 
     Raises
     ------
@@ -332,12 +332,27 @@ def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, s
     converged = _converged(target, places, values)
     evidence = Bridge(np.nan, np.nan)
     if converged:
-        half = places.shape[1] // 2
-        rng = np.random.default_rng(np.random.SeedSequence([*seed, chains, 2]))
-        mixture = fit_mixture(places[:, :half].reshape(-1, k), COMPONENTS, rng)
-        proposal = _defended(target, mixture, DEFENCE)
-        evidence = bridge(target, places[:, half:], values[:, half:], proposal, rng)
+        evidence = _evidence(target, places, values, np.random.SeedSequence([*seed, chains, 2]))
     return _Pixel(kept, gain, sigma, evidence, converged)
+
+
+def _evidence(target: Target, places: np.ndarray, values: np.ndarray, stream: np.random.SeedSequence) -> Bridge:
+    """Mean of two bridges: the mixture is fitted to one half of the ensembles, the bridge built to the other one.
+
+    A mixture that knows the draws it is compared with would give too little. A single ensemble is halved in time.
+    """
+    rng, k = np.random.default_rng(stream), places.shape[-1]
+    if len(places) == 1:
+        length = values.shape[1] // 2 * 2
+        places, values = (x[:, :length].reshape(2, length // 2, *x.shape[2:]) for x in (places, values))
+    halves = np.array_split(np.arange(len(places)), 2)
+    found = []
+    for own, other in (halves, halves[::-1]):
+        mixture = fit_mixture(places[other].reshape(-1, k), COMPONENTS, rng)
+        found.append(bridge(target, places[own], values[own], _defended(target, mixture, DEFENCE), rng))
+    logs, errors = np.array(found).T
+    error = 0.5 * max(float(np.sqrt(np.sum(errors**2))), abs(float(logs[0] - logs[1])))
+    return Bridge(float(np.mean(logs)), error)
 
 
 def _converged(target: Target, places: np.ndarray, values: np.ndarray) -> bool:

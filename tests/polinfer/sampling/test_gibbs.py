@@ -37,7 +37,7 @@ PRIORS = {
     "diattenuation": TruncatedNormal(0.3, 0.4, -1, 1),
     "retardance": VonMises(1.0, 2.0),
     "retardance_angle": AxialVonMises(0.3, 1.5),
-    "circularity": AxialVonMises(0.5, 1.0),
+    "circularity": VonMises(0.4, 1.5),
 }
 # every kind of conditional at least once; more combinations: python -m benchmarks calibration
 CASES = {
