@@ -4,9 +4,10 @@ The priors are flat, or at least finite, in the angles. Against the uniform meas
 or of the disk of the polariser, they would have poles, ``1 / (sin^2(eta / 2) |sin 2 theta_eta|)`` and ``1 / |D|``, in
 which a walker sticks. The coordinates are therefore the angles, with D = sin delta, in which the matrix is smooth:
 
-- A circle of period P is unrolled onto a line, and the density is multiplied by ``cos^2(pi u / 2 P)`` for a distance
-  ``|u| < P`` from a centre. Of the copies of every angle that lie P apart the factors add up to 1, so the angle modulo
-  P keeps its distribution and the integral its value, and there is neither a wrap nor an edge.
+- A circle of period P is unrolled onto a line, and the density is multiplied by a share of the distance u from a
+  centre: 1 up to |u| = 0.35 P, 0 from 0.65 P on, and a squared cosine between. Of the copies of every angle that lie
+  P apart the shares add up to 1, so the angle modulo P keeps its distribution and the integral its value, and there is
+  neither a wrap nor an edge. A density narrower than 0.35 P has one copy only, and no faint ones that walkers miss.
 - The density is the sum over the equivalent copies of a point (:func:`polinfer.orbit`; the maps keep volumes), times a
   factor that adds up to 1 over the copies of every point and is next to 1 near the centre: shares of
   ``exp(6 sum_i cos(2 pi u_i / P_i))``. Copies differ by half a period in at least one circle, so the walkers need to
@@ -36,6 +37,7 @@ from ..records import PERIODS, Parameters
 __all__ = ["Target", "centre_of", "copies", "draw_prior", "periods"]
 
 BLOCK = 1024  # points of a large batch; smaller ones are padded, so that two shapes are compiled
+RAMP = 0.15  # half the length of the ramp between shares of 1 and 0, in periods
 CONTRAST = 6.0  # a copy at a distance has e^-12 of the weight
 
 
@@ -88,8 +90,13 @@ def draw_prior(model: Model, centre: np.ndarray, rng: np.random.Generator, count
     u = x[:, circle] - centre[circle]
     size = period[circle]
     u -= size * np.floor(u / size)  # in [0, P): the other copy within reach is at u - P
-    x[:, circle] = centre[circle] + np.where(rng.uniform(size=u.shape) < np.cos(0.5 * pi * u / size) ** 2, u, u - size)
+    x[:, circle] = centre[circle] + np.where(rng.uniform(size=u.shape) < _root_share(u / size) ** 2, u, u - size)
     return x
+
+
+def _root_share(u: np.ndarray) -> np.ndarray:
+    """Square root of the share of an angle ``u`` periods from the centre."""
+    return np.asarray(np.cos(0.5 * pi * np.clip((np.abs(u) - 0.5 + RAMP) / (2 * RAMP), 0, 1)))
 
 
 def _log_kernel(model: Model, centre: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -173,13 +180,13 @@ class Target:
         period = periods(self.model)
         circle = np.isfinite(period)
         u = (x[:, circle] - self.centre[circle]) / period[circle]
-        inside = np.all(np.abs(u) < 1, axis=1)
+        inside = np.all(np.abs(u) < 0.5 + RAMP, axis=1)
         if "diattenuation" in self.model.free:
             inside &= np.abs(x[:, self.model.free.index("diattenuation")]) <= asin(1.0)
-        factor = np.where(np.abs(u) < 1, np.cos(0.5 * pi * u), 1.0)
+        factor = np.where(inside[:, None], _root_share(u), 1.0)
         kernel = _log_kernel(self.model, self.centre, x)
         share = kernel[:, 0] - _log_sum(kernel)
-        return np.where(inside, share + 2 * np.sum(np.log(np.abs(factor)), axis=1), -np.inf)
+        return np.where(inside, share + 2 * np.sum(np.log(factor), axis=1), -np.inf)
 
 
 def _log_sum(values: np.ndarray) -> np.ndarray:

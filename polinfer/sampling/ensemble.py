@@ -74,8 +74,8 @@ class Ensemble:
     """
 
     walkers: int = 32
-    warmup: int = 300
-    thin: int = 20
+    warmup: int = 200
+    thin: int = 10
     backend: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -329,7 +329,7 @@ def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, s
     kept = Parameters(*(x[:, :draws] for x in parameters))
     drawn = [draw_nuisances(target.model, own, m[:draws], r) for m, r in zip(matrices, streams, strict=True)]
     gain, sigma = (None if x[0] is None else np.stack(x) for x in zip(*drawn, strict=True))
-    converged = _converged(target, places, values)
+    converged = _converged(places, values)
     evidence = Bridge(np.nan, np.nan)
     if converged:
         evidence = _evidence(target, places, values, np.random.SeedSequence([*seed, chains, 2]))
@@ -355,15 +355,9 @@ def _evidence(target: Target, places: np.ndarray, values: np.ndarray, stream: np
     return Bridge(float(np.mean(logs)), error)
 
 
-def _converged(target: Target, places: np.ndarray, values: np.ndarray) -> bool:
-    """Whether the coordinates agree between the ensembles, and walkers have forgotten where they were.
-
-    Circles count by their cosine and sine, so that it does not matter in which turn a walker is.
-    """
-    period = periods(target.model)
-    circle = np.isfinite(period)
-    phase = 2 * np.pi * (places[..., circle] - target.centre[circle]) / period[circle]
-    series = np.concatenate([np.cos(phase), np.sin(phase), places[..., ~circle], values[..., None]], axis=-1)
+def _converged(places: np.ndarray, values: np.ndarray) -> bool:
+    """Whether the coordinates agree between the ensembles, and walkers have forgotten where they were."""
+    series = np.concatenate([places, values[..., None]], axis=-1)
     records = values.shape[1]
     length = records // 2
     if length < 2:
