@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from ..checks import one_of_types
 from ..records import Measurement
@@ -100,7 +100,7 @@ def ordering_screen(measurement: Measurement) -> OrderingScreen:
         pixels=count,
         excess=excess,
         excess_error=error,
-        probability=norm.sf(excess / error),
+        probability=ndtr(-excess / error),
         lead=lead,
         scatter=scatter,
         verdict=NAMES[int(lead < 0)] if found else UNDECIDED,

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chisquare
 
 from ..checks import as_generator, complex_array, integer, one_of_types, real_number
 from ..model import Model
@@ -41,6 +40,8 @@ class Ranks:
 
     def p_values(self, bins: int = 20) -> np.ndarray:
         """Of a chi-square test that the ranks are uniform in so many equal bins, for each invariant."""
+        from scipy.stats import chisquare  # slow to import
+
         bins = integer("bins", bins, low=2)
         place = ((self.ranks + 0.5) / (self.draws + 1) * bins).astype(int)
         return np.array([chisquare(np.bincount(row, minlength=bins)).pvalue for row in place])

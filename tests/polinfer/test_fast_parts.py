@@ -209,7 +209,7 @@ def test_priors_and_their_derivatives_are_those_of_the_densities(name):
         slope = jax.grad(log_density)
         every = jax.jit(jax.vmap(lambda x, f=log_density, g=slope: (f(x), g(x), jax.grad(g)(x))))
         value, slope, bend = (np.asarray(x) for x in every(y))
-        term = priors._term(name, prior)
+        term = priors.term(name, prior)
         found = term.evaluate(pair) or (0.0, 0.0, 0.0)
         np.testing.assert_allclose(term.constant + found[0], value, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(found[1] + 0 * y, slope, rtol=1e-10, atol=1e-10 * (1 + np.abs(slope).max()))
@@ -228,7 +228,7 @@ def test_priors_and_their_derivatives_are_those_of_the_densities(name):
     ],
 )
 def test_priors_without_such_a_form_are_left_to_the_general_route(name, prior):
-    assert priors._term(name, prior) is None
+    assert priors.term(name, prior) is None
 
 
 def test_transformed_priors_are_those_of_the_equivalent_parameters():

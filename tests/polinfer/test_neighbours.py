@@ -199,7 +199,10 @@ def test_a_window_over_the_whole_frame_gives_every_pixel_the_same_fit_and_sharpe
         assert np.ptp(np.abs(result.gain)) > 0
 
 
-@pytest.mark.parametrize(("gain", "noise"), [("none", "known"), ("complex", "known"), ("phase", "pixel")])
+@pytest.mark.parametrize(
+    ("gain", "noise"),
+    [("none", "known"), ("complex", "known"), pytest.param("phase", "pixel", marks=pytest.mark.slow)],
+)
 def test_the_fit_of_a_window_is_a_maximum_of_the_windowed_density(gain, noise):
     measurement = scene("weights" if gain == "none" else "shared", (3, 4), sigma=0.1)
     declared = {} if noise == "known" else {"noise": NOISES[noise]}

@@ -34,7 +34,7 @@ from .sweep import Observed, State
 __all__ = ["draw_gibbs"]
 
 BLOCKS = (64, 512)  # numbers of pixels for which code is compiled
-BATCH = 25  # draws between two looks at the clock, and the length of the batches of the diagnostics
+BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
 MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
 EVIDENCE_BLOCK = 32  # pixels
@@ -164,45 +164,46 @@ class _Chains:
             self.gain = np.empty((chains, draws, pixels), np.result_type(dtype, np.complex64))
         self.precision = None if problem.plan.noise == "known" else np.empty((chains, draws, pixels), dtype)
         self.sums: np.ndarray | None = None
-        self.lengths = [min(BATCH, draws - begin) for begin in range(0, draws, BATCH)]
+        # all batches have the same length, for which code is compiled; what is left of the last is dropped
+        self.length = min(BATCH, -(-draws // LEAST_BATCHES))
+        self.batches = -(-draws // self.length)
 
     def store(self, number: int, take: Any, count: int, batch: kernel.Batch) -> None:
         """Batch ``number`` of the pixels ``take``, of which ``count`` are meant."""
-        begin = number * BATCH
-        span = slice(begin, begin + self.lengths[number])
-        new = np.asarray(batch.parameters)[..., :count]
+        begin = number * self.length
+        kept = min(self.length, self.parameters.shape[2] - begin)
+        span = slice(begin, begin + kept)
+        new = np.asarray(batch.parameters)[:kept, ..., :count]
         self.parameters[:, :, span, take] = np.moveaxis(new, (0, 1, 2), (2, 0, 1))
         if self.gain is not None:
-            pair = np.asarray(batch.gain)[..., :count]  # (draws, 2, chains, pixels)
+            pair = np.asarray(batch.gain)[:kept, ..., :count]  # (draws, 2, chains, pixels)
             self.gain[:, span, take] = np.moveaxis(pair[:, 0] + 1j * pair[:, 1], 0, 1)
         if self.precision is not None:
-            self.precision[:, span, take] = np.moveaxis(np.asarray(batch.precision)[..., :count], 0, 1)
+            self.precision[:, span, take] = np.moveaxis(np.asarray(batch.precision)[:kept, ..., :count], 0, 1)
         assert self.sums is not None
         self.sums[number][..., take] = np.asarray(batch.sums, float)[..., :count]
 
 
-def convergence(sums: np.ndarray, lengths: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest split R-hat and least effective draws over the invariants, (pixels).
 
-    ``sums`` ``(batches, 2, invariants, chains, pixels)`` of batches of so many draws. The effective number comes from
-    the variance of the batch means.
+    ``sums`` ``(batches, 2, invariants, chains, pixels)`` of batches of ``length`` draws. The effective number comes
+    from the variance of the batch means.
     """
-    length = np.asarray(lengths, float)
-    full = length == length[0]
-    means = sums[full, 0] / length[0]
-    n = length[full].sum()
-    within = sums[full, 1].sum(0) / n - (sums[full, 0].sum(0) / n) ** 2  # (invariants, chains, pixels)
+    means = sums[:, 0] / length
     batches, chains = means.shape[0], means.shape[2]
+    n = batches * length
+    within = sums[:, 1].sum(0) / n - (sums[:, 0].sum(0) / n) ** 2  # (invariants, chains, pixels)
     half = max(batches // 2, 1)
     halves = np.stack([means[:half].mean(0), means[-half:].mean(0)])  # (2, invariants, chains, pixels)
     variance = np.maximum(within.mean(axis=1), 0)
     spread = halves.swapaxes(0, 1).reshape(halves.shape[1], -1, halves.shape[-1]).var(axis=1, ddof=1)
-    size = half * length[0]
+    size = half * length
     still = variance <= 1e-12 * np.max(variance, axis=0, initial=1e-30)  # what a fixed parameter makes constant
     with np.errstate(divide="ignore", invalid="ignore"):
         r_hat = np.sqrt((size - 1) / size + spread / variance)
         scatter = np.moveaxis(means, 1, 0).reshape(means.shape[1], -1, means.shape[-1])
-        total = scatter.var(axis=1, ddof=1) * length[0]
+        total = scatter.var(axis=1, ddof=1) * length
         effective = chains * n * (variance + spread) / np.maximum(total, 1e-300)
     r_hat = np.where(still, 1.0, r_hat)
     effective = np.where(still, chains * n, np.minimum(effective, 2 * chains * n))
@@ -232,11 +233,9 @@ def _run(
         )  # fmt: skip
         stream = jax.tree.map(jnp.asarray, stream)
         run = (problem.plan, problem.balanced)
-        warm = -(-sampler.warmup // BATCH)
-        for number in range(-warm, len(store.lengths)):
-            state, stream, batch = kernel.advance(
-                *run, BATCH if number < 0 else store.lengths[number], thin, data, reference, centre, state, stream
-            )
+        warm = -(-sampler.warmup // store.length)
+        for number in range(-warm, store.batches):
+            state, stream, batch = kernel.advance(*run, store.length, thin, data, reference, centre, state, stream)
             if number >= 0:
                 store.store(number, own, count, batch)
         done(count)
@@ -297,20 +296,20 @@ def draw_gibbs(
     problem = _problem(known, model, measurement, fit, good)
     store = _Chains(problem, chains, draws, len(good))
     invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1, None), jnp.ones((1, 1))))
-    store.sums = np.zeros((len(store.lengths), 2, invariants, chains, len(good)))
+    store.sums = np.zeros((store.batches, 2, invariants, chains, len(good)))
     pixels = np.arange(len(good))
     for attempt, more in enumerate((1, *MORE)):
         _run(problem, store, pixels, good, chains, sampler, sampler.thin * more, seed, attempt, done)
         if known.noise == "frame":
             break
-        r_hat, effective = convergence(store.sums[..., pixels], store.lengths)
+        r_hat, effective = convergence(store.sums[..., pixels], store.length)
         # few draws cannot reach the number asked for, and their R-hat scatters
         enough = min(sampler.effective, 0.2 * chains * draws)
         pixels = pixels[(r_hat > LARGEST_R + 2 / np.sqrt(chains * draws)) | (effective < enough)]
         if len(pixels) == 0:
             break
     converged = np.ones(len(good), bool)
-    r_hat, effective = convergence(store.sums, store.lengths)
+    r_hat, effective = convergence(store.sums, store.length)
     enough = min(sampler.effective, 0.2 * chains * draws)
     converged = (r_hat <= LARGEST_R + 2 / np.sqrt(chains * draws)) & (effective >= enough)
     evidence = np.full((2, len(good)), np.nan)

@@ -258,6 +258,7 @@ def test_gain_and_sigma_follow_their_density_given_the_matrix(gain, noise):
         assert abs(found.mean() - expected) < 4.5 * found.std() / np.sqrt(count) + 2e-4
 
 
+@pytest.mark.slow
 def test_walkers_that_have_not_mixed_give_no_evidence():
     # one state of light leaves two of the five parameters open: a curved ridge, along which walkers are slow
     model = Model(gain=PhaseGain())

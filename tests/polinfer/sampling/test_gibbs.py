@@ -54,7 +54,10 @@ def prior_draws(model: Model, count: int, rng: np.random.Generator) -> Parameter
     return Parameters(*(model.priors[name].sample(rng, (count,)) for name in Parameters._fields))
 
 
-@pytest.mark.parametrize("name", CASES)
+SLOW = {"sigma of every pixel", "one state"}  # the general route of fit is compiled for them
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in CASES])
 def test_means_of_invariants(name):
     model, states, sigma = CASES[name]
     rng = np.random.default_rng(11)
