@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtri
 
 from ...fitting.fast.data import times_adjoint
 from ...fitting.fast.engine import pairs_of
@@ -38,6 +39,7 @@ BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batc
 MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
 EVIDENCE_BLOCK = 32  # pixels
+PURPOSES = 8  # streams of a pixel and chain that one attempt may use
 SPREAD = 1.5  # standard deviations by which the chains are moved apart at the start
 
 
@@ -97,14 +99,13 @@ def _observed(problem: Problem, index: np.ndarray) -> Observed:
     )
 
 
-def _point(problem: Problem, index: np.ndarray, chains: int, rng: np.random.Generator | None) -> Point:
-    """Chains at the fit's parameters, moved apart if there is a generator; ``(chains, pixels)``."""
+def _point(problem: Problem, index: np.ndarray, chains: int, apart: list[np.ndarray] | None = None) -> Point:
+    """Chains at the fit's parameters, moved ``apart`` by so many standard deviations; all ``(chains, pixels)``."""
     values = []
-    for name in Parameters._fields:
+    for i, name in enumerate(Parameters._fields):
         value = np.broadcast_to(np.nan_to_num(problem.fit[name][index]), (chains, len(index)))
-        if rng is not None and problem.plan.fixed[Parameters._fields.index(name)] is None:
-            std = np.minimum(np.nan_to_num(problem.fit[f"std_{name}"][index]), 0.5)
-            value = value + SPREAD * std * rng.normal(size=value.shape)
+        if apart is not None and problem.plan.fixed[i] is None:
+            value = value + np.minimum(np.nan_to_num(problem.fit[f"std_{name}"][index]), 0.5) * apart[i]
         values.append(value)
     values[0] = np.clip(values[0], -0.999, 0.999)
     if problem.plan.bounded:
@@ -119,7 +120,7 @@ def _point(problem: Problem, index: np.ndarray, chains: int, rng: np.random.Gene
 
 def _inside(problem: Problem, index: np.ndarray, point: Point) -> Point:
     """Where a prior forbids the moved start, the fit's own."""
-    unmoved = _point(problem, index, point[0][0].shape[0], None)
+    unmoved = _point(problem, index, point[0][0].shape[0])
     allowed: Any = True
     for prior, pair in zip(problem.plan.prior, point, strict=True):
         found = None if prior is None else prior.evaluate(pair)
@@ -128,8 +129,11 @@ def _inside(problem: Problem, index: np.ndarray, point: Point) -> Point:
     return jax.tree.map(lambda a, b: jnp.where(allowed, a, b), point, unmoved)
 
 
-def _start(problem: Problem, index: np.ndarray, chains: int, rng: np.random.Generator) -> State:
-    point = _inside(problem, index, _point(problem, index, chains, rng))
+def _start(problem: Problem, index: np.ndarray, chains: int, numbers: np.ndarray, seed: int, attempt: int) -> State:
+    """Where the chains begin; of the frame a pixel's start depends on its number only."""
+    words = [begin(seed, numbers, chains, PURPOSES * attempt + 1 + i)[0] for i in range(5)]
+    apart = [SPREAD * ndtri((w + 0.5) / 2.0**32) for w in words]
+    point = _inside(problem, index, _point(problem, index, chains, apart))
     shape, dtype = (chains, len(index)), problem.dtype
     gain = (np.ones(shape, dtype), np.zeros(shape, dtype))
     if "gain" in problem.fit:
@@ -222,11 +226,10 @@ def _run(
         own = pixels[begin_at : begin_at + size]
         count = len(own)
         index = np.concatenate([own, np.full(size - count, own[0])])
-        stream = begin(seed, numbers[index], chains, 2 * attempt)
-        draws_start = np.random.default_rng([seed, 1, attempt, int(numbers[own[0]])])
+        stream = begin(seed, numbers[index], chains, PURPOSES * attempt)
         data, reference = jax.tree.map(jnp.asarray, _observed(problem, index)), _reference(problem, index)
-        state = _start(problem, index, chains, draws_start)
-        centre_state = State(_point(problem, index, 1, None), state.gain, state.precision[:1])
+        state = _start(problem, index, chains, numbers[index], seed, attempt)
+        centre_state = State(_point(problem, index, 1), state.gain, state.precision[:1])
         centre = jnp.stack(
             [jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, centre_state.point,
                                                                            centre_state.precision)]
@@ -259,7 +262,7 @@ def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
     found = np.empty((2, len(good)))
     _, chains, draws, _ = store.parameters.shape
     factors = np.array([0.5, 2.0, 1.0])[:, None, None, None]
-    kept = np.linspace(0, draws - 1, max(min(draws, MOST_DRAWS // chains) // 10 * 10, min(draws, 10))).astype(int)
+    kept = np.linspace(0, draws - 1, max(min(draws, MOST_DRAWS // chains) // 10 * 10, 10)).astype(int)
 
     def block(begin_at: int) -> None:
         index = np.arange(begin_at, min(begin_at + EVIDENCE_BLOCK, len(good)))
@@ -295,7 +298,7 @@ def draw_gibbs(
         raise ValueError(f"model: the Gibbs sampler cannot draw from it, because {known}; use sampler=Ensemble().")
     problem = _problem(known, model, measurement, fit, good)
     store = _Chains(problem, chains, draws, len(good))
-    invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1, None), jnp.ones((1, 1))))
+    invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1), jnp.ones((1, 1))))
     store.sums = np.zeros((store.batches, 2, invariants, chains, len(good)))
     pixels = np.arange(len(good))
     for attempt, more in enumerate((1, *MORE)):
