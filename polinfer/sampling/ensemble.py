@@ -114,9 +114,11 @@ def draw_ensemble(
     seed: int,
     progress: bool = False,
     good: np.ndarray | None = None,
+    found: Fit | None = None,
 ) -> Raw:
     """Draws from the posterior of the pixels ``good``, flat indices; None: all that are neither masked nor non-finite.
 
+    ``found`` are the most probable parameters that the walkers start around, None: fit them here.
     ``chains`` ensembles are run for each pixel, and ``draws`` draws of each are kept (see :class:`Ensemble` for their
     order). The random numbers of an ensemble come from ``SeedSequence([seed, flat index of the pixel, ensemble])``, so
     they do not depend on the other pixels. With neighbours the parameters are those of the window around each pixel;
@@ -133,7 +135,7 @@ def draw_ensemble(
     _check(model, sampler)
     prepared = prepare(model, measurement, model.noise.integrated)
     chosen = prepared.good if good is None else np.asarray(good, np.int64)
-    found = _fit(model, measurement, chosen)
+    found = _fit(model, measurement, chosen) if found is None else found
     folder = None if sampler.backend is None else Path(sampler.backend)
     bar = _bar(progress, len(chosen) * chains)
     pixels = []

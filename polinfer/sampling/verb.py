@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from ..checks import as_generator, integer, one_of_types
-from ..degeneracy import nearest, orbit
+from ..degeneracy import nearest
 from ..fitting import fit
+from ..fitting.local_gaussian import equivalent
 from ..model import Model
 from ..records import Fit, Measurement, Parameters, Status
 from .draws import Draws
@@ -19,8 +20,6 @@ from .raw import Raw
 __all__ = ["sample"]
 
 LEAST = 4  # draws of a chain
-# of a fit, what remains true of draws
-KEPT = Status.MASKED | Status.NON_FINITE | Status.BAD_FIT | Status.AT_EDGE
 
 
 def sample(
@@ -84,7 +83,7 @@ def sample(
     if isinstance(sampler, Gibbs):
         raw = _with_bar(model, measurement, found, good, sampler, chains, draws, seed, progress)
     else:
-        raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good)
+        raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good, found)
         raw = raw._replace(parameters=_aligned(raw.parameters, found, good))
     return _assemble(model, measurement, found, good, raw, sampler, seed)
 
@@ -100,12 +99,9 @@ def _with_bar(
 
 
 def _aligned(parameters: Parameters, found: Fit, good: np.ndarray) -> Parameters:
-    """Of the copies of every draw the one nearest to the fit; what is fixed or drops out does not move."""
+    """Of the copies of every draw that the model can tell apart the one nearest to the fit."""
     reference = Parameters(*(np.nan_to_num(np.asarray(x, float).reshape(-1)[good]) for x in found.parameters))
-    given = Parameters(*(np.nan_to_num(np.asarray(x, float)) for x in parameters))
-    if found.model.fixed:
-        return given
-    return nearest(orbit(given), reference)
+    return nearest(equivalent(found.model, Parameters(*(np.asarray(x, float) for x in parameters))), reference)
 
 
 def _assemble(
@@ -127,9 +123,8 @@ def _assemble(
     values = {name: spread(getattr(raw.parameters, name)) for name in Parameters._fields}
     for name in model.dropped:
         values[name] = np.full_like(values[name], np.nan)
-    status = np.ravel(found.status & int(KEPT)).astype(np.int32)
-    for name in Parameters._fields:
-        status |= np.ravel(found.status).astype(np.int32) & int(Status.unidentified(name))
+    # whether the climb to the maximum converged says nothing about the draws
+    status = np.ravel(found.status).astype(np.int32) & ~int(Status.NOT_CONVERGED)
     status[good] |= np.where(raw.converged, 0, int(Status.NOT_CONVERGED)).astype(np.int32)
     return Draws(
         model, measurement, Parameters(**values), spread(raw.log_evidence), spread(raw.log_evidence_error),

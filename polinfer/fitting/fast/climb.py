@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..newton import tolerance
-from .data import Data
+from .data import Data, times
 from .likelihoods import Residual, Slopes
 from .linear import factorise, solve
-from .overlap import coefficients, energy, overlap, overlap_slopes, turned
-from .point import Point, matrix, polariser_vectors, retarder_vectors, rotate, unit
+from .overlap import coefficients, energy, imaginary, overlap, overlap_slopes, turned
+from .point import Point, matrix, polariser_vector, retarder_vector, rotate, unit
 from .priors import COPIES, Term, log_prior
 from .scene import Scene
 
@@ -37,22 +37,10 @@ class Posterior(NamedTuple):
 
 def evaluate(scene: Scene, data: Data, point: Point) -> tuple[Any, Residual]:
     """Log posterior, all constants included, from the residual itself."""
-    u, _ = polariser_vectors(point)
-    q, _ = retarder_vectors(point)
-    seen = matrix(scene.retarder_first, u, q)
-    model = [
-        [tuple(_product(seen[i], [data.illumination[k][j] for k in (0, 1)], part) for part in (0, 1)) for j in (0, 1)]
-        for i in (0, 1)
-    ]
-    at = scene.likelihood.residual(model, data.response)
+    seen = matrix(scene.retarder_first, polariser_vector(*point[:2]), retarder_vector(*point[2:]))
+    at = scene.likelihood.residual(times(seen, data.illumination), data.response)
     value = scene.likelihood.value(at) + data.constant
     return value + (log_prior(scene.prior, point) + scene.constant), at
-
-
-def _product(row: list[Any], column: list[Any], part: int) -> Any:
-    if part == 0:
-        return sum(a[0] * b[0] - a[1] * b[1] for a, b in zip(row, column, strict=True))
-    return sum(a[0] * b[1] + a[1] * b[0] for a, b in zip(row, column, strict=True))
 
 
 def derivatives(scene: Scene, balanced: bool, data: Data, point: Point, at: Residual) -> Posterior:
@@ -69,8 +57,7 @@ def derivatives(scene: Scene, balanced: bool, data: Data, point: Point, at: Resi
     if slopes.rr is not None:
         outer.append((slopes.rr, first.gradient, first.gradient))
     if slopes.across is not None:
-        across = type(k)(*((im, -re) for re, im in k))
-        _, slant = overlap_slopes(coefficients(scene.retarder_first, across), point)
+        _, slant = overlap_slopes(coefficients(scene.retarder_first, imaginary(k)), point)
         outer.append((slopes.across, slant, slant))
     if not balanced:
         second = energy(scene.retarder_first, data.power, point)

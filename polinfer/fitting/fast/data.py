@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from .overlap import Pauli, pauli
 from .point import Pair
 
-__all__ = ["Data", "prepare"]
+__all__ = ["Data", "prepare", "times", "times_adjoint"]
 
 Matrix = list[list[Pair]]
 
@@ -33,8 +33,7 @@ class Data(NamedTuple):
     one: Any
 
 
-def _times(a: Pair, b: Pair) -> Pair:
-    """``a conj(b)``."""
+def _conjugate(a: Pair, b: Pair) -> Pair:
     return a[0] * b[0] + a[1] * b[1], a[1] * b[0] - a[0] * b[1]
 
 
@@ -42,9 +41,18 @@ def _sum(a: Pair, b: Pair) -> Pair:
     return a[0] + b[0], a[1] + b[1]
 
 
+def _times(a: Pair, b: Pair) -> Pair:
+    return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
+
+
+def times(a: Matrix, b: Matrix) -> Matrix:
+    """``a b``."""
+    return [[_sum(_times(a[i][0], b[0][j]), _times(a[i][1], b[1][j])) for j in (0, 1)] for i in (0, 1)]
+
+
 def times_adjoint(a: Matrix, b: Matrix) -> Matrix:
     """``a b^H``."""
-    return [[_sum(_times(a[i][0], b[j][0]), _times(a[i][1], b[j][1])) for j in (0, 1)] for i in (0, 1)]
+    return [[_sum(_conjugate(a[i][0], b[j][0]), _conjugate(a[i][1], b[j][1])) for j in (0, 1)] for i in (0, 1)]
 
 
 def prepare(balanced: bool, illumination: Matrix, response: Matrix, residual: Any, constant: Any, one: Any) -> Data:

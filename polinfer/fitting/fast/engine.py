@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,6 +13,7 @@ import numpy as np
 
 from ...records import Parameters
 from ...statistics import Statistics
+from ...threads import each
 from . import kernel
 from .climb import moved
 from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROWS, WIDE, rows
@@ -96,17 +95,6 @@ def _fill(index: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([index, np.full(size - len(index), index[0])])
 
 
-def _each(work: Callable[[int], None], items: Iterable[int]) -> None:
-    items = list(items)
-    cores = os.cpu_count() or 1
-    if len(items) == 1 or cores == 1:
-        for item in items:
-            work(item)
-        return
-    with ThreadPoolExecutor(min(cores, 4)) as pool:
-        list(pool.map(work, items))
-
-
 def _pass(
     scene: Scene, frame: Frame, index: np.ndarray | None, start: np.ndarray | None, given: int, iterations: int,
     out: np.ndarray, flags: np.ndarray, done: Callable[[int], Any],
@@ -132,7 +120,7 @@ def _pass(
         flags[begin:end] = np.asarray(bits)[: end - begin]
         done(end - begin)
 
-    _each(work, range(0, count, size))
+    each(work, range(0, count, size))
 
 
 def _alternatives(points: np.ndarray) -> list[np.ndarray]:

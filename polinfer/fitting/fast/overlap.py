@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from .point import Pair, Point, Vector, dot, polariser_vectors, retarder_vectors
 
-__all__ = ["Derivatives", "Pauli", "coefficients", "energy", "overlap", "overlap_slopes", "pauli", "quadratic_forms",
-           "turned"]  # fmt: skip
+__all__ = ["Derivatives", "Pauli", "coefficients", "energy", "imaginary", "overlap", "overlap_slopes", "pauli",
+           "quadratic_forms", "turned"]  # fmt: skip
 
 FREE_PAIRS = [(i, j) for i in range(5) for j in range(i, 5)]
 
@@ -49,6 +49,11 @@ def turned(k: Pauli, phase: Pair) -> Pauli:
     """The components times ``conj(phase)``."""
     c, s = phase
     return Pauli(*((re * c + im * s, im * c - re * s) for re, im in k))
+
+
+def imaginary(k: Pauli) -> Pauli:
+    """-i times the components: their real parts are the imaginary parts of those."""
+    return Pauli(*((im, -re) for re, im in k))
 
 
 def coefficients(retarder_first: bool, k: Pauli) -> list[Vector]:

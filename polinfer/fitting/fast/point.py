@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-__all__ = ["Pair", "Point", "dot", "matrix", "polariser_vectors", "retarder_vectors", "rotate", "unit"]
+__all__ = ["Pair", "Point", "dot", "matrix", "polariser_vector", "polariser_vectors", "retarder_vector",
+           "retarder_vectors", "rotate", "unit"]  # fmt: skip
 
 Pair = tuple[Any, Any]
 Vector = list[Any]
@@ -55,6 +56,19 @@ def rotate(pair: Pair, step: Any) -> Pair:
     length = 1.5 - 0.5 * (c * c + s * s)
     scale = (1 + square) / length
     return (c * (1 - square) - s * step) / scale, (s * (1 - square) + c * step) / scale
+
+
+def polariser_vector(diattenuation: Pair, angle: Pair) -> Vector:
+    """u of the angles 0 and 1, ``point[:2]``."""
+    (c, s), (x, y) = diattenuation, angle
+    return [c, s * x, s * y]
+
+
+def retarder_vector(retardance: Pair, angle: Pair, circularity: Pair) -> Vector:
+    """q of the angles 2, 3 and 4, ``point[2:]``."""
+    (c, s), (x, y), (a, b) = retardance, angle, circularity
+    sy = s * y
+    return [c, s * x, sy * a, sy * b]
 
 
 def polariser_vectors(point: Point) -> tuple[Vector, dict[tuple[int, ...], Vector]]:

@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from .data import Data
-from .overlap import Pauli, coefficients
-from .point import Pair, Point, dot, unit
+from .overlap import Pauli, coefficients, imaginary
+from .point import Pair, Point, dot, polariser_vector, unit
 from .scene import Scene
 
 __all__ = ["closed_form"]
@@ -30,12 +30,11 @@ def closed_form(scene: Scene, data: Data) -> Point:
     value = jnp.minimum(jnp.sqrt(x * x + y * y), 0.999)
     cosine = jnp.sqrt(0.5 * (1 + jnp.sqrt(1 - value * value)))
     first, second = _fixed(scene, 0, (cosine, 0.5 * value / cosine)), _fixed(scene, 1, unit(x, y))
-    (c, s), (a, b) = first, second
-    u = [c, s * a, s * b]
+    u = polariser_vector(first, second)
     # seen through the polariser the matrix is a complex quaternion; the retarder is its real part
     q = _quaternion(scene.retarder_first, k, u)
     if scene.likelihood.free_phase:
-        other = _quaternion(scene.retarder_first, _imaginary(k), u)
+        other = _quaternion(scene.retarder_first, imaginary(k), u)
         half = _half_phase(q, other)
         q = [half[0] * part + half[1] * rest for part, rest in zip(q, other, strict=True)]
         down = q[0] < 0
@@ -55,11 +54,6 @@ def closed_form(scene: Scene, data: Data) -> Point:
 def _fixed(scene: Scene, index: int, pair: Pair) -> Pair:
     known = scene.fixed[index]
     return pair if known is None else (jnp.full_like(pair[0], known[0]), jnp.full_like(pair[0], known[1]))
-
-
-def _imaginary(k: Pauli) -> Pauli:
-    """-i times the components, whose real parts are the imaginary parts of the others."""
-    return Pauli(*((im, -re) for re, im in k))
 
 
 def _quaternion(retarder_first: bool, k: Pauli, u: list[Any]) -> list[Any]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -24,6 +22,7 @@ from ...model import Model
 from ...noise import InferredNoise, KnownNoise
 from ...records import Fit, Measurement, Parameters
 from ...statistics import Statistics
+from ...threads import each
 from ..raw import Raw
 from . import kernel
 from .evidence import MOST_DRAWS, Given, log_evidence, unavailable
@@ -243,18 +242,7 @@ def _run(
                 store.store(number, own, count, batch)
         done(count)
 
-    _each(block, range(0, len(pixels), size))
-
-
-def _each(work: Callable[[int], None], items: range) -> None:
-    """On all cores; compiled code and large NumPy operations release the lock."""
-    cores = os.cpu_count() or 1
-    if len(items) == 1 or cores == 1:
-        for item in items:
-            work(item)
-        return
-    with ThreadPoolExecutor(min(cores, 8)) as pool:
-        list(pool.map(work, items))
+    each(block, range(0, len(pixels), size))
 
 
 def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
@@ -279,7 +267,7 @@ def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
         )  # fmt: skip
         found[:, index] = log_evidence(problem.plan, given)
 
-    _each(block, range(0, len(good), EVIDENCE_BLOCK))
+    each(block, range(0, len(good), EVIDENCE_BLOCK))
     return found
 
 

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import i0e, logsumexp
 
-from ...fitting.fast.overlap import Pauli, coefficients, quadratic_forms, turned
+from ...fitting.fast.overlap import Pauli, coefficients, imaginary, quadratic_forms, turned
+from ...fitting.fast.point import polariser_vector, retarder_vector
 from ...fitting.fast.priors import COPIES
 from .plan import Any1D, Plan, conjugate, normal
 
@@ -74,15 +75,6 @@ def _log_prior(plan: Plan, index: int, y: Any) -> Any:
     return value if isinstance(own, Any1D) else value + own.constant
 
 
-def _imaginary(k: Pauli) -> Pauli:
-    return Pauli(*((im, -re) for re, im in k))
-
-
-def _quaternion(y: np.ndarray) -> list[Any]:
-    (c2, s2), (c3, s3), (c4, s4) = (_pair(x) for x in y)
-    return [c2, s2 * c3, s2 * s3 * c4, s2 * s3 * s4]
-
-
 def _stokes(plan: Plan, given: Given, q: list[Any]) -> list[Any] | None:
     """z and x components of the light's Stokes vector where it meets the polariser; None: balanced."""
     if given.balanced:
@@ -101,7 +93,7 @@ def _log_conditional(plan: Plan, given: Given, retarder: np.ndarray, gain: np.nd
     k, weight = given.product, np.ones(())
     if gain is not None:
         k, weight = turned(k, (gain.real, gain.imag)), np.abs(gain) ** 2
-    q = _quaternion(retarder)
+    q = retarder_vector(*map(_pair, retarder))
     v = [2 * sum(t * x for t, x in zip(row, q, strict=True)) for row in coefficients(plan.retarder_first, k)]
     stokes = _stokes(plan, given, q)
     y0, y1 = given.point[0], given.point[1]
@@ -162,12 +154,12 @@ def _log_integral(v: list[Any], marginal: Any) -> np.ndarray:
 
 def _log_joint(plan: Plan, given: Given, nodes: int) -> np.ndarray:
     """``log p(data, p*)``: likelihood times priors, the retarder and the gain integrated out, (pixels)."""
-    u = _polariser(given.point)
-    forms = [coefficients(plan.retarder_first, k) for k in (given.product, _imaginary(given.product))]
+    u = polariser_vector(*map(_pair, given.point[:2]))
+    forms = [coefficients(plan.retarder_first, k) for k in (given.product, imaginary(given.product))]
     w = [[sum(t[i][j] * u[i] for i in range(3)) for j in range(4)] for t in forms]
     prior = sum(np.asarray(_log_prior(plan, i, given.point[i])) for i in (0, 1))
     if not {2, 3, 4} & set(plan.free):
-        q = _quaternion(given.point[2:])
+        q = retarder_vector(*map(_pair, given.point[2:]))
         return given.constant + prior + _log_likelihood(plan, given, w, q, given.point)
     pixels = given.point.shape[1]
     parts = np.array_split(np.arange(pixels), max(pixels * nodes**3 // 400_000, 1))  # to stay in the cache
@@ -184,11 +176,6 @@ def _take(given: Given, part: np.ndarray) -> Given:
         constant=given.constant[part],
         retarder=given.retarder[..., part],
     )
-
-
-def _polariser(point: np.ndarray) -> list[Any]:
-    (c, s), (x, y) = _pair(point[0]), _pair(point[1])
-    return [c, s * x, s * y]
 
 
 def _log_likelihood(plan: Plan, given: Given, w: list[list[Any]], q: list[Any], point: np.ndarray) -> Any:
@@ -227,18 +214,13 @@ def _retarder_integral(plan: Plan, given: Given, w: list[list[Any]], nodes: int)
         points.append((low[:, None] + half[:, None] * (1 + x))[tuple(shape)])
         weights.append((np.log(half)[:, None] + np.log(weight))[tuple(shape)])
     expand = [[a[:, None, None, None] for a in row] for row in w]
-    value = _log_likelihood(plan, given, expand, _quaternion_of(points), given.point)
+    value = _log_likelihood(plan, given, expand, retarder_vector(*map(_pair, points)), given.point)
     priors = []
     for copy in COPIES[:4]:
         moved = [sign * y + shift for y, (sign, shift) in zip(points, copy[2:], strict=True)]
         priors.append(sum(np.asarray(_log_prior(plan, i, y)) for i, y in zip((2, 3, 4), moved, strict=True)))
     total = value + np.logaddexp.reduce(np.broadcast_arrays(*priors)) + sum(weights)
     return np.asarray(logsumexp(total, axis=(1, 2, 3)))
-
-
-def _quaternion_of(points: list[np.ndarray]) -> list[Any]:
-    (c2, s2), (c3, s3), (c4, s4) = (_pair(y) for y in points)
-    return [c2, s2 * c3, s2 * s3 * c4, s2 * s3 * s4]
 
 
 def _box(draws: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

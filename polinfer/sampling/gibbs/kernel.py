@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ...fitting.fast.point import Point
+from ...fitting.fast.point import Point, retarder_vector
 from ...fitting.fast.priors import FACTORS
 from ...records import PERIODS, Parameters
 from .plan import Plan
@@ -33,11 +33,11 @@ class Batch(NamedTuple):
 
 def invariants(plan: Plan, point: Point, precision: Any) -> list[Any]:
     """Functions of a state that are the same for all parameter sets of one matrix."""
-    (c0, s0), (c1, s1), (c2, s2), (c3, s3), (c4, s4) = point
+    (c0, s0), (c1, s1), *_ = point
     d = 2 * s0 * c0
     found = [jnp.abs(d), d * c1, d * s1] if {0, 1} & set(plan.free) else []
     if {2, 3, 4} & set(plan.free):
-        q = [c2, s2 * c3, s2 * s3 * c4, s2 * s3 * s4]
+        q = retarder_vector(*point[2:])
         if plan.bounded:
             found += q
         else:  # the other sign of q is the other sign of the gain
@@ -61,7 +61,9 @@ def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
         other = d * d_ref + (x * cx + y * sx) < 0  # half the difference of the squared distances
         flip = jnp.where(other, -1, 1).astype(d.dtype)
         d, x, y = flip * d, flip * x, flip * y
-    if movable >= {2, 3, 4}:
+    # the exchanges that move free angles only
+    flips, turns = ((1, -1) if movable >= own else (1,) for own in ({2, 3}, {3, 4}))
+    if len(flips) * len(turns) > 1:
         # eta = 2 y2: its sine; cosines of the differences, axes count by their doubled angle
         sine = 2 * c2 * s2
         along, across = c3 * ct, s3 * st
@@ -70,8 +72,8 @@ def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
         best: Any = -jnp.inf
         a: Any = jnp.ones_like(sine)
         b: Any = a
-        for f in (1, -1):
-            for g in (1, -1):
+        for f in flips:
+            for g in turns:
                 value = cosine_part + f * sine * se + f * along + f * g * across + g * turn
                 better = value > best
                 best = jnp.where(better, value, best)

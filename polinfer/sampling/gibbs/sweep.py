@@ -13,9 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from ...fitting.fast.climb import moved
+from ...fitting.fast.data import times
 from ...fitting.fast.likelihoods import square
-from ...fitting.fast.overlap import Pauli, coefficients, quadratic_forms, turned
-from ...fitting.fast.point import Pair, Point, dot, matrix
+from ...fitting.fast.overlap import Pauli, coefficients, imaginary, quadratic_forms, turned
+from ...fitting.fast.point import Pair, Point, dot, matrix, polariser_vector, retarder_vector
 from ...fitting.fast.priors import Harmonic
 from .circle import chord, diattenuation, direction, half_circle, slice_step, von_mises
 from .plan import Any1D, Plan, conjugate, normal
@@ -47,15 +48,6 @@ class State(NamedTuple):
     point: Point
     gain: Pair
     precision: Any
-
-
-def _imaginary(k: Pauli) -> Pauli:
-    return Pauli(*((im, -re) for re, im in k))
-
-
-def _vectors(point: Point) -> tuple[list[Any], list[Any]]:
-    (c0, s0), (c1, s1), (c2, s2), (c3, s3), (c4, s4) = point
-    return [c0, s0 * c1, s0 * s1], [c2, s2 * c3, s2 * s3 * c4, s2 * s3 * s4]
 
 
 def _times(t: list[list[Any]], q: list[Any]) -> list[Any]:
@@ -113,7 +105,7 @@ def _polariser(
     plan: Plan, balanced: bool, data: Observed, t: list[list[Any]], weight: Any, point: Point, random: Random
 ) -> Point:
     (c, s), (x, y), *_ = point
-    _, q = _vectors(point)
+    q = retarder_vector(*point[2:])
     v = [2 * value for value in _times(t, q)]
     if balanced:
         stokes = None
@@ -186,7 +178,7 @@ def _scale(random: Random, prior: Any) -> Any:
 def _retarder(
     plan: Plan, balanced: bool, data: Observed, t: list[list[Any]], weight: Any, point: Point, random: Random
 ) -> Point:
-    u, _ = _vectors(point)
+    u = polariser_vector(*point[:2])
     w = [2 * value for value in _transposed(t, u)]
     form = None
     if not balanced and plan.retarder_first:
@@ -244,8 +236,8 @@ def _exchange(plan: Plan, copy: Any, behind: Any, point: Point, random: Random) 
 
 def _overlaps(plan: Plan, data: Observed, point: Point) -> Pair:
     """``tr(J^H K)``."""
-    u, q = _vectors(point)
-    found = (dot(u, _times(coefficients(plan.retarder_first, k), q)) for k in (data.product, _imaginary(data.product)))
+    u, q = polariser_vector(*point[:2]), retarder_vector(*point[2:])
+    found = (dot(u, _times(coefficients(plan.retarder_first, k), q)) for k in (data.product, imaginary(data.product)))
     re, im = found
     return re, im
 
@@ -257,7 +249,7 @@ def _energy(plan: Plan, balanced: bool, data: Observed, point: Point) -> Any:
         return total
     (c, s), (x, y), *_ = point
     if plan.retarder_first:
-        _, q = _vectors(point)
+        q = retarder_vector(*point[2:])
         stokes = [dot(q, [dot(row, q) for row in form]) for form in quadratic_forms(data.power)]
     else:
         stokes = [data.power.z[0], data.power.x[0]]
@@ -276,12 +268,8 @@ def _gain(plan: Plan, balanced: bool, data: Observed, point: Point, precision: A
 
 
 def _precision(plan: Plan, data: Observed, point: Point, gain: Pair, old: Any, random: Random) -> Any:
-    u, q = _vectors(point)
-    seen = matrix(plan.retarder_first, u, q)
-    fields = [
-        [tuple(_product(seen[i], [data.illumination[m][j] for m in (0, 1)], part) for part in (0, 1)) for j in (0, 1)]
-        for i in (0, 1)
-    ]
+    seen = matrix(plan.retarder_first, polariser_vector(*point[:2]), retarder_vector(*point[2:]))
+    fields = times(seen, data.illumination)
     misfit = data.residual + square(fields, data.response, None if plan.gain == "unit" else gain)
     count = jnp.broadcast_to(data.count, misfit.shape)
     if plan.noise == "frame":
@@ -291,12 +279,6 @@ def _precision(plan: Plan, data: Observed, point: Point, gain: Pair, old: Any, r
         drawn = random.gamma(jnp.broadcast_to(plan.shape + count, old.shape), jnp.broadcast_to(random_old, old.shape))
         return jnp.broadcast_to(drawn[:, :1] / (plan.scale + misfit), old.shape)
     return random.gamma(plan.shape + count, old * (plan.scale + misfit)) / (plan.scale + misfit)
-
-
-def _product(row: list[Pair], column: list[Pair], part: int) -> Any:
-    if part == 0:
-        return sum(a[0] * b[0] - a[1] * b[1] for a, b in zip(row, column, strict=True))
-    return sum(a[0] * b[1] + a[1] * b[0] for a, b in zip(row, column, strict=True))
 
 
 def _stabiliser(
@@ -311,11 +293,11 @@ def _stabiliser(
     theta|)``, by whose ratio the move is accepted.
     """
     (c, s), (x, y), *_ = point
-    _, q = _vectors(point)
+    q = retarder_vector(*point[2:])
     low = 0.5 * (c - s)
     u = [low, -low * x, -low * y]
     k = turned(data.product, gain)
-    t, across = (coefficients(plan.retarder_first, part) for part in (k, _imaginary(k)))
+    t, across = (coefficients(plan.retarder_first, part) for part in (k, imaginary(k)))
     b, d = 2 * precision * dot(u, _times(t, q)), -2 * precision * dot(u, _times(across, q))
     one = jnp.ones_like(c)
     twice = von_mises(random, b, d, (one, 0 * one))

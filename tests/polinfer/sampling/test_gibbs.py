@@ -58,7 +58,7 @@ SLOW = {"sigma of every pixel", "one state"}  # the general route of fit is comp
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in CASES])
-def test_means_of_invariants(name):
+def test_means_of_invariants_and_the_log_evidence(name):
     model, states, sigma = CASES[name]
     rng = np.random.default_rng(11)
     truth = Parameters(*(np.full(COPIES, x[0]) for x in prior_draws(Model(), 1, rng)))
@@ -66,13 +66,22 @@ def test_means_of_invariants(name):
     known = model.noise.sigma(one) is not None if not isinstance(model.noise, InferredNoise) else False
     # the same data in every pixel: independent runs
     data = Measurement(states, np.repeat(one.response, COPIES, axis=0), sigma if known else None)
-    draws = sample(model, data, Gibbs(evidence=False), draws=500, rng=5)
+    draws = sample(model, data, draws=500, rng=5)
     assert not np.any(draws.status & int(Status.NOT_CONVERGED))
     ours = np.stack([np.asarray(x) for x in invariants(model, draws.parameters).values()]).mean(axis=(1, 2))
     points = prior_draws(model, PRIOR_DRAWS, rng)
     small = Measurement(states, one.response, sigma if known else None)
     log_weight = np.asarray(model.log_likelihood(points, small), float)
     weight = np.exp(log_weight - log_weight.max())
+    if known:
+        assert np.all(draws.log_evidence_error < 0.05)
+        off = draws.log_evidence - np.log(weight.mean()) - log_weight.max()
+        error = np.hypot(off.std(ddof=1) / COPIES**0.5, weight.std() / weight.mean() / PRIOR_DRAWS**0.5)
+        assert abs(off.mean()) < 4.5 * error
+        # the stated errors are the scatter
+        assert 0.6 < off.std() / np.sqrt(np.mean(draws.log_evidence_error**2)) < 1.6
+    else:
+        assert np.isnan(draws.log_evidence).all()
     weight /= weight.sum()
     values = np.stack([np.asarray(x) for x in invariants(model, points).values()])
     mean = values @ weight
@@ -143,6 +152,22 @@ def test_every_draw_is_the_copy_nearest_to_the_fit():
         if np.isfinite(period):
             off = off - period * np.round(off / period)
         assert np.abs(off / getattr(found.std, name)[sure]).max() < 7
+
+
+@pytest.mark.parametrize("fixed", [{"circularity": 0.4}, {"retardance": 1.1}, {"diattenuation": 0.3}], ids=str)
+@pytest.mark.parametrize("sampler", [Gibbs(evidence=False), Ensemble(warmup=50, thin=2)], ids=["gibbs", "ensemble"])
+def test_with_a_part_fixed_all_draws_are_still_of_one_copy(fixed, sampler):
+    model, truth = Model(fixed=fixed), Parameters(*(np.full(2, x) for x in (0.3, 0.5, 1.1, 0.4, 0.4)))
+    data = simulate(model, truth, BALANCED, 0.01, rng=2)
+    found, draws = fit(model, data), sample(model, data, sampler, draws=64, rng=1)
+    for name, period in zip(Parameters._fields, (np.inf, np.pi, 2 * np.pi, np.pi, 2 * np.pi), strict=True):
+        if name in fixed:
+            np.testing.assert_allclose(getattr(draws.parameters, name), fixed[name], rtol=1e-6)
+            continue
+        off = getattr(draws.parameters, name) - getattr(found.parameters, name)
+        if np.isfinite(period):
+            off = off - period * np.round(off / period)
+        assert np.abs(off / getattr(found.std, name)).max() < 7
 
 
 class Third(RetarderFirst):
