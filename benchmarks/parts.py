@@ -5,8 +5,8 @@ sigma for all, truths from the priors. Three kinds of pairs:
 
 *Written without.* ``fit(Model(), measurement)`` has a gain, weights, a map of the noise, a mask, a window, missing
 states and an earlier fit switched off. Against it stand the same blocks, Newton steps and summary with code from
-:mod:`benchmarks.without`, in which a part does not exist: a likelihood that knows no gain; a kernel without weights;
-one with sigma as a number in the compiled code; a verb that never looks for a mask, a window, a missing state,
+:mod:`benchmarks.minimal_fits`, in which a part does not exist: a likelihood that knows no gain; a kernel without
+weights; one with sigma as a number in the compiled code; a verb that never looks for a mask, a window, a missing state,
 illumination of its own in a pixel or an earlier fit; and all of these at once. ``fixed={"diattenuation": 0}`` stands
 against a matrix, its derivatives and a closed form of the retarder alone, ``fixed={"retardance": 0}`` against those of
 the diattenuator alone, both in a verb without any of the parts. Both sides of a pair must find the same log posterior.
@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 import polinfer
-from benchmarks import scenes, without
+from benchmarks import minimal_fits, scenes
 from benchmarks.results import Results, alternating_seconds, in_fresh_process
 from polinfer import ComplexGain, Fit, Measurement, Model, Window
 
@@ -68,17 +68,17 @@ def written_without(dtype: str, size: int, repeats: int) -> dict[str, Any]:
     full, rows = Model(), {}
     data = {model: _data(model, dtype, size) for model in (full, RETARDER, POLARISER)}
     pairs = {
-        "gain": (full, without.Leave(gain=True)),
-        "weights": (full, without.Leave(weights=True)),
-        "noise map": (full, without.Leave(noise_map=True)),
-        "mask, window, missing states, start": (full, without.Leave()),
-        "all of these": (full, without.Leave(gain=True, weights=True, noise_map=True)),
-        "diattenuation, and all of these": (RETARDER, without.Leave(True, True, True, element="retarder")),
-        "retardance, and all of these": (POLARISER, without.Leave(True, True, True, element="polariser")),
+        "gain": (full, minimal_fits.Leave(gain=True)),
+        "weights": (full, minimal_fits.Leave(weights=True)),
+        "noise map": (full, minimal_fits.Leave(noise_map=True)),
+        "mask, window, missing states, start": (full, minimal_fits.Leave()),
+        "all of these": (full, minimal_fits.Leave(gain=True, weights=True, noise_map=True)),
+        "diattenuation, and all of these": (RETARDER, minimal_fits.Leave(True, True, True, element="retarder")),
+        "retardance, and all of these": (POLARISER, minimal_fits.Leave(True, True, True, element="polariser")),
     }
     for name, (model, leave) in pairs.items():
         given = data[model]
-        rows[name] = _pair(partial(polinfer.fit, model, given), partial(without.fit, model, given, leave), repeats)
+        rows[name] = _pair(partial(polinfer.fit, model, given), partial(minimal_fits.fit, model, given, leave), repeats)
     return rows
 
 

@@ -27,8 +27,8 @@ __all__ = ["DESIGN", "DESIGN_WARM", "Part", "Prepared", "chunk_size", "fit_chunk
 
 CHUNK = 2048  # pixels whose starting points are in memory at once
 LEAST = 64
-ITERATIONS = 60
-DESIGN, DESIGN_WARM = 6, 2  # starts from the design, without and with an earlier fit
+ITERATIONS, PATIENT = 200, 1000  # at most, from a start and from the best point found
+DESIGN, DESIGN_WARM = 12, 2  # starts from the design, without and with an earlier fit
 
 
 class _Best(NamedTuple):
@@ -81,7 +81,7 @@ def _search(
     parameters = _canonical(model, _arrays(model, best), statistics)
     # another copy may have the better prior, and then its maximum is close by
     polished, top, converged = maximise(
-        model, statistics, np.arange(pixels), from_parameters(model, parameters).astype(dtype), ITERATIONS
+        model, statistics, np.arange(pixels), from_parameters(model, parameters).astype(dtype), PATIENT
     )
     return _Best(_canonical(model, _arrays(model, polished), statistics), top, converged)
 

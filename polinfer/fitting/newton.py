@@ -1,8 +1,10 @@
 """Damped Newton iterations on the log posterior of many one-pixel problems at once.
 
 One problem is a pixel and a start. The Hessian is exact (automatic differentiation), its eigenvalues are made positive,
-the step is limited, and a step that lowers the density is never taken. A fixed number of problems (lanes) is advanced
-together by compiled code; finished ones make room for the next, so that a slow pixel does not hold up the others.
+the step is limited. Along a narrow curved valley of misfit the way leads over its side: a step that lowers the density
+is taken if one of the few after it comes out higher, else it is taken back and damped. A fixed number of problems
+(lanes) is advanced together by compiled code; finished ones make room for the next, so that a slow pixel does not hold
+up the others.
 """
 
 from __future__ import annotations
@@ -25,16 +27,28 @@ __all__ = ["maximise"]
 ROUND = 6  # iterations between two looks at which lanes have finished
 LONGEST_STEP = 0.7  # radians in chart coordinates
 KICK = 0.05  # step off a saddle
+PATIENCE = 4  # steps that may lie below the best point
 FEW, MANY = 64, 1024  # numbers of lanes for which code is compiled
 
 
-class _State(NamedTuple):
-    """Of every problem; JAX arrays inside compiled code, NumPy arrays outside."""
+class _Place(NamedTuple):
+    """A point and the log posterior there."""
 
     point: Any
     value: Any
     gradient: Any
     hessian: Any
+
+
+class _State(NamedTuple):
+    """Of every problem: where it is, and the best so far; JAX arrays inside compiled code, NumPy arrays outside.
+
+    ``astray`` counts the steps since the best.
+    """
+
+    here: _Place
+    best: _Place
+    astray: Any
     damping: Any
     finished: Any
     converged: Any
@@ -60,47 +74,46 @@ def value_gradient_hessian(
 
 def _advance(model: Model, statistics: Statistics | Windowed, state: _State) -> _State:
     """One iteration of one problem."""
-    dtype = state.point.dtype
+    here, dtype = state.here, state.here.point.dtype
     eps = jnp.finfo(dtype).eps
     # Unit diagonal: what the prior says of a parameter that the data do not see is not lost beside a curvature of 1e16.
-    scale = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(state.hessian)), 1e-3))
+    scale = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(here.hessian)), 1e-3))
     # the slope is rounded like eps times the square of the signal-to-noise ratio, the step like eps times that ratio
     enough = tolerance(np.dtype(dtype)) + 10 * (eps * jnp.max(scale)) ** 2
-    curvature, axes = jnp.linalg.eigh(-state.hessian / (scale[:, None] * scale))
+    curvature, axes = jnp.linalg.eigh(-here.hessian / (scale[:, None] * scale))
     floor = 30 * eps
-    slope = axes.T @ (state.gradient / scale)
+    slope = axes.T @ (here.gradient / scale)
     size = jnp.maximum(jnp.abs(curvature), floor)
     # along negative curvature the point is not a maximum even if the slope vanishes there
     kick = KICK / jnp.max(jnp.abs(axes / scale[:, None]), axis=0)
     saddle = (curvature < -floor) & (-curvature * kick**2 > 2 * enough)
     decrement = jnp.sum(slope**2 / size)
-    converged = (decrement < enough) & ~jnp.any(saddle) & jnp.isfinite(state.value)
+    converged = (decrement < enough) & ~jnp.any(saddle) & jnp.isfinite(here.value) & (state.astray == 0)
     step = slope / (size + state.damping)
     kick = jnp.where(slope < 0, -kick, kick) / (1 + state.damping)
     step = (axes @ jnp.where(saddle & (jnp.abs(step) < jnp.abs(kick)), kick, step)) / scale
     step = step * jnp.minimum(1, LONGEST_STEP / jnp.maximum(jnp.max(jnp.abs(step)), 1e-30))
-    first = ~jnp.isfinite(state.value)  # the state holds no density yet: look at the point itself
-    trial = jnp.where(first, state.point, state.point + step)
+    first = ~jnp.isfinite(here.value)  # the state holds no density yet: look at the point itself
+    trial = jnp.where(first, here.point, here.point + step)
     value, gradient, hessian = value_gradient_hessian(
         lambda x: model.log_density(to_parameters(model, x), statistics), trial
     )
     usable = jnp.isfinite(value) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
     # a residual near its minimum is rounded like eps times the signal-to-noise ratio
     rounding = 20 * eps * (1 + jnp.max(scale))
-    better = usable & (first | (value >= state.value - rounding)) & ~converged
+    better = usable & (first | (value >= state.best.value - rounding)) & ~converged
+    lower = usable & ~better & ~converged & (state.astray < PATIENCE)
     damping = jnp.where(better, 0.1 * state.damping, jnp.maximum(10 * state.damping, 1e-2))
     damping = jnp.where(damping < 1e-3, 0, damping)
+    damping = jnp.where(first, 0, jnp.where(lower, state.damping, damping))
     stuck = ~first & ~better & (jnp.max(jnp.abs(step)) < 30 * eps)
-
-    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(better, new, old)
-
+    new = _Place(trial, value, gradient, hessian)
+    best = jax.tree.map(partial(jnp.where, better), new, state.best)
     return _State(
-        choose(trial, state.point),
-        choose(value, state.value),
-        choose(gradient, state.gradient),
-        choose(hessian, state.hessian),
-        jnp.where(first, 0, damping),
+        jax.tree.map(partial(jnp.where, lower), new, best),
+        best,
+        jnp.where(lower, state.astray + 1, 0),
+        damping,
         state.finished | converged | stuck | (first & ~usable),
         state.converged | converged,
     )
@@ -125,11 +138,16 @@ def _advance_round(model: Model, statistics: Statistics | Windowed, state: _Stat
 def _fresh(points: np.ndarray) -> _State:
     lanes, free = points.shape
     dtype = points.dtype
-    return _State(
+    place = _Place(
         points,
         np.full(lanes, -np.inf, dtype),
         np.zeros((lanes, free), dtype),
-        np.broadcast_to(-np.eye(free, dtype=dtype), (lanes, free, free)).copy(),
+        np.broadcast_to(-np.eye(free, dtype=dtype), (lanes, free, free)),
+    )
+    return _State(
+        jax.tree.map(np.copy, place),
+        jax.tree.map(np.copy, place),
+        np.zeros(lanes, np.int32),
         np.zeros(lanes, dtype),
         np.zeros(lanes, bool),
         np.zeros(lanes, bool),
@@ -152,13 +170,13 @@ def maximise(
     while len(waiting):
         active, waiting = waiting[:lanes], waiting[lanes:]
         index = np.concatenate([active, np.full(lanes - len(active), active[0])])
-        lane = _State(*(x[index] for x in state))
+        lane = jax.tree.map(lambda x, chosen=index: x[chosen], state)
         lane.finished[len(active) :] = True
         data = jax.tree.map(lambda x, chosen=pixels[index]: x[chosen], host)
         done = _advance_round(model, data, lane)
-        for old, new in zip(state, done, strict=True):
+        for old, new in zip(jax.tree.leaves(state), jax.tree.leaves(done), strict=True):
             old[active] = np.asarray(new)[: len(active)]
         spent[active] += ROUND
         again = active[~state.finished[active] & (spent[active] < iterations)]
         waiting = np.concatenate([waiting, again])
-    return np.asarray(state.point), np.asarray(state.value), np.asarray(state.converged)
+    return state.best.point, state.best.value, state.converged

@@ -25,6 +25,7 @@ __all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "froz
 LONGEST_STEP = 0.7  # radians of any angle y
 LEAST_CURVATURE = 1e-6  # of a direction of which neither data nor prior say anything
 ROOT_HALF = 0.5**0.5
+PATIENCE = 4  # steps that may lie below the best point
 
 
 class Posterior(NamedTuple):
@@ -165,12 +166,13 @@ def better_copy(scene: Scene, point: Point) -> Point:
 
 
 def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any, exchange: Any = True) -> Point:
-    """At most ``iterations`` damped Newton steps uphill, none of which lowers the density.
+    """At most ``iterations`` damped Newton steps uphill; the best point that they reach.
 
-    With ``exchange`` a point gives way to an equivalent one with a higher prior on the way.
+    A step that lowers the density is taken if one of the next ``PATIENCE`` comes out higher, else taken back. With
+    ``exchange`` a point gives way to an equivalent one with a higher prior on the way.
     """
 
-    def best(point: Point) -> Point:
+    def higher(point: Point) -> Point:
         if len(scene.groups) == 1:
             return point
         return jax.tree.map(partial(jnp.where, exchange), better_copy(scene, point), point)
@@ -180,7 +182,7 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
     free = scene.free
 
     def advance(carry: Any) -> Any:
-        count, point, value, damping, done = carry
+        count, point, best, value, damping, age, done = carry
         _, at = evaluate(scene, data, point)
         slope = with_prior(scene.prior, point, derivatives(scene, balanced, data, point, at))
         slope = held(slope, frozen(scene, point, slope.gradient))
@@ -195,26 +197,32 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         lower, smallest = factorise(a, len(free), LEAST_CURVATURE)
         step, decrement = solve(lower, [slope.gradient[i] for i in free])
         decrement = decrement / data.one
-        arrived = (decrement < enough) & (smallest > lowest) & (damping == 0)
+        arrived = (decrement < enough) & (smallest > lowest) & (damping == 0) & (age == 0)
         pairs = list(point)
         for i, x in zip(free, step, strict=True):
             pairs[i] = rotate(point[i], jnp.clip(x, -LONGEST_STEP, LONGEST_STEP))
-        trial = best(_project(scene, Point(*pairs)))
+        trial = higher(_project(scene, Point(*pairs)))
         new = evaluate(scene, data, trial)[0] / data.one
         accept = (new >= value - rounding) & ~done
-        damping = jnp.where(accept, 0.1 * damping, jnp.maximum(10 * damping, 1e-2))
+        # along a narrow curved valley of misfit the way leads over its side, if the next steps come out higher
+        astray = ~accept & jnp.isfinite(new) & (age < PATIENCE)
+        failed = ~accept & ~astray
+        damping = jnp.where(accept, 0.1 * damping, jnp.where(failed, jnp.maximum(10 * damping, 1e-2), damping))
         damping = jnp.where(damping < 1e-3, 0.0, damping)
-        point = jax.tree.map(partial(jnp.where, accept), trial, point)
+        best = jax.tree.map(partial(jnp.where, accept), trial, best)
+        point = jax.tree.map(lambda t, b: jnp.where(astray & ~done, t, b), trial, best)
         # the last step is taken, too: it is paid for, and leaves far less to gain than was asked for
-        return count + 1, point, jnp.where(accept, new, value), damping, done | arrived | ~jnp.isfinite(value)
+        done = done | arrived | ~jnp.isfinite(value)
+        return count + 1, point, best, jnp.where(accept, new, value), damping, jnp.where(astray, age + 1, 0), done
 
     def unfinished(carry: Any) -> Any:
-        return (carry[0] < iterations) & ~jnp.all(carry[4])
+        return (carry[0] < iterations) & ~jnp.all(carry[-1])
 
-    point = best(point)
+    point = higher(point)
     value, at = evaluate(scene, data, point)
     # the residual is rounded like eps times the signal-to-noise ratio, and is squared
     rounding = 10 * eps * (1 + data.strength) * jnp.sqrt(1 + at.square) / data.one
     zero = jnp.zeros_like(value)
-    carry = (jnp.zeros((), jnp.int32), point, value, zero, jnp.zeros(value.shape, bool))
-    return jax.lax.while_loop(unfinished, advance, carry)[1]
+    none = jnp.zeros(value.shape, bool)
+    carry = (jnp.zeros((), jnp.int32), point, point, value, zero, none.astype(jnp.int32), none)
+    return jax.lax.while_loop(unfinished, advance, carry)[2]

@@ -25,7 +25,7 @@ from .climb import (
 )  # fmt: skip
 from .data import Data
 from .linear import Triangle, factorise, inverse, solve
-from .point import Point
+from .point import Point, sine_of_double
 from .priors import COPIES, FACTORS, log_prior
 from .scene import Scene
 
@@ -131,7 +131,7 @@ def _best(candidates: list[_Candidate], values: Parameters) -> Any:
 
 
 def _values(scene: Scene, point: Point) -> Parameters:
-    found = [2 * point.diattenuation[0] * point.diattenuation[1]]
+    found = [sine_of_double(point.diattenuation)]
     for name, (c, s) in zip(Parameters._fields[1:], point[1:], strict=True):
         found.append(jnp.arctan2(s, c) / getattr(FACTORS, name))
     return Parameters(*(x if v is None else jnp.full_like(x, v) for x, v in zip(found, scene.values, strict=True)))

@@ -24,7 +24,7 @@ from .scene import Scene
 __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
 
 BLOCKS = (1024, 4096)  # numbers of pixels for which code is compiled
-FIRST, MOST = 3, 60  # Newton steps of the first pass, and of the others
+FIRST, MOST, PATIENT = 3, 60, 500  # Newton steps of the first pass, of the others, and of the last
 
 
 @dataclass(frozen=True)
@@ -180,12 +180,13 @@ def solve_frame(
         told = pairs_of(earlier, frame.dtype)
         finite = np.isfinite(told).all(axis=0)
         again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
+    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points], iterations=PATIENT)
     return out, flags
 
 
 def _again(
     scene: Scene, frame: Frame, out: np.ndarray, flags: np.ndarray, which: np.ndarray,
-    starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]], given: int = kernel.GIVEN,
+    starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]], given: int = kernel.GIVEN, iterations: int = MOST,
 ) -> None:  # fmt: skip
     """Climb again from other starts, and keep what is better."""
     index = np.flatnonzero(which)
@@ -194,7 +195,7 @@ def _again(
     new, bits = np.empty((len(out), len(index)), out.dtype), np.empty(len(index), np.int32)
     points = pairs_of(Parameters(*out[ROWS["parameters"]][:, index]), frame.dtype)
     for begun in starts(points, index):
-        _pass(scene, frame, index, begun, given, MOST, new, bits, lambda _: None)
+        _pass(scene, frame, index, begun, given, iterations, new, bits, lambda _: None)
         value, old = new[ROWS["log_posterior"]], out[ROWS["log_posterior"], index]
         # what is better by rounding only is worth no change, unless it settles a pixel
         slack, rounding = (1e-9, 1e-6) if out.dtype == np.float64 else (1e-4, 0.05)

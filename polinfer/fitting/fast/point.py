@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 __all__ = ["Pair", "Point", "dot", "matrix", "polariser_vector", "polariser_vectors", "retarder_vector",
-           "retarder_vectors", "rotate", "unit"]  # fmt: skip
+           "retarder_vectors", "rotate", "sine_of_double", "unit"]  # fmt: skip
 
 Pair = tuple[Any, Any]
 Vector = list[Any]
@@ -56,6 +56,14 @@ def rotate(pair: Pair, step: Any) -> Pair:
     length = 1.5 - 0.5 * (c * c + s * s)
     scale = (1 + square) / length
     return (c * (1 - square) - s * step) / scale, (s * (1 - square) + c * step) / scale
+
+
+def sine_of_double(pair: Pair) -> Any:
+    """``2 cos y sin y``, next to 1 and -1 to within rounding of the result, not of its square root."""
+    c, s = pair
+    cosine = (c - s) * (c + s)
+    away = cosine * cosine / (1 + jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0)))
+    return jnp.where(jnp.abs(cosine) < 0.5, jnp.sign(s) * (1 - away), 2 * c * s)
 
 
 def polariser_vector(diattenuation: Pair, angle: Pair) -> Vector:

@@ -33,7 +33,7 @@ from .sweep import Observed, State
 
 __all__ = ["draw_gibbs"]
 
-BLOCKS = (64, 512)  # numbers of pixels for which code is compiled
+BLOCKS, FEW = (16, 512), 128  # numbers of pixels for which code is compiled; up to FEW pixels take small ones
 BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
 MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
@@ -219,7 +219,7 @@ def _run(
 ) -> None:  # fmt: skip
     """Draw for the pixels with the places ``pixels`` and the numbers ``numbers`` in the frame."""
     frame = problem.plan.noise == "frame"
-    size = len(pixels) if frame else BLOCKS[0] if len(pixels) <= BLOCKS[0] else BLOCKS[1]
+    size = len(pixels) if frame else BLOCKS[0] if len(pixels) <= FEW else BLOCKS[1]
 
     def block(begin_at: int) -> None:
         own = pixels[begin_at : begin_at + size]
@@ -289,20 +289,20 @@ def draw_gibbs(
     invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1), jnp.ones((1, 1))))
     store.sums = np.zeros((store.batches, 2, invariants, chains, len(good)))
     pixels = np.arange(len(good))
+    # few draws cannot reach the number asked for, and their R-hat scatters
+    enough, largest = min(sampler.effective, 0.2 * chains * draws), LARGEST_R + 2 / np.sqrt(chains * draws)
+    # the number from so many batches is uncertain: twice its standard error
+    surely = min(enough * (1 + 2 * (2 / (chains * store.batches)) ** 0.5), 0.25 * chains * draws)
     for attempt, more in enumerate((1, *MORE)):
         _run(problem, store, pixels, good, chains, sampler, sampler.thin * more, seed, attempt, done)
         if known.noise == "frame":
             break
         r_hat, effective = convergence(store.sums[..., pixels], store.length)
-        # few draws cannot reach the number asked for, and their R-hat scatters
-        enough = min(sampler.effective, 0.2 * chains * draws)
-        pixels = pixels[(r_hat > LARGEST_R + 2 / np.sqrt(chains * draws)) | (effective < enough)]
+        pixels = pixels[(r_hat > largest) | (effective < surely)]
         if len(pixels) == 0:
             break
-    converged = np.ones(len(good), bool)
     r_hat, effective = convergence(store.sums, store.length)
-    enough = min(sampler.effective, 0.2 * chains * draws)
-    converged = (r_hat <= LARGEST_R + 2 / np.sqrt(chains * draws)) & (effective >= enough)
+    converged = (r_hat <= largest) & (effective >= enough)
     evidence = np.full((2, len(good)), np.nan)
     if sampler.evidence and unavailable(known) is None:
         evidence = _evidence(problem, store, good)

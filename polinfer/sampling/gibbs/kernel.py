@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ...fitting.fast.point import Point, retarder_vector
 from ...fitting.fast.priors import FACTORS
 from ...records import PERIODS, Parameters
+from .circle import angle
 from .plan import Plan
 from .random import Random, Stream
 from .sweep import Observed, State, sweep
@@ -84,7 +85,7 @@ def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
     found = [jnp.clip(d, -1, 1)]
     for name, (c, s) in zip(Parameters._fields[1:], pairs, strict=True):
         half = 0.5 * getattr(PERIODS, name)
-        found.append(jnp.clip(jnp.arctan2(s, c) / getattr(FACTORS, name), -half, half))
+        found.append(jnp.clip(angle((c, s)) / getattr(FACTORS, name), -half, half))
     return jnp.stack([jnp.broadcast_to(x, found[0].shape) for x in found]), sign
 
 

@@ -287,14 +287,15 @@ def _stabiliser(
     """The retarder and the phase of the gain along the direction in which a strong polariser hardly changes J.
 
     ``A_ret -> exp(i alpha n.s) A_ret`` (on the other side for the polariser first) and ``g -> g exp(-i alpha)`` with
-    ``n.s = cos 2 theta_D Z - sin 2 theta_D X``, which commutes with the polariser: of the two projectors along n.s
-    only one turns, by ``-2 alpha``, and the likelihood is von Mises in ``2 alpha``. The priors of the angles are
-    uniform along it only up to their density against the uniform one of rotations, ``1 / (sin^2(eta/2) |sin 2
-    theta|)``, by whose ratio the move is accepted.
+    ``n.s = cos 2 theta_D Z - sin 2 theta_D X`` (its negative where D < 0), which commutes with the polariser: of the
+    two projectors along n.s only that of the weaker transmission turns, by ``-2 alpha``, and the likelihood is von
+    Mises in ``2 alpha``. The priors of the angles are uniform along it only up to their density against the uniform one
+    of rotations, ``1 / (sin^2(eta/2) |sin 2 theta|)``, by whose ratio the move is accepted.
     """
     (c, s), (x, y), *_ = point
     q = retarder_vector(*point[2:])
-    low = 0.5 * (c - s)
+    x, y = jnp.where(s < 0, -x, x), jnp.where(s < 0, -y, y)
+    low = 0.5 * (c - jnp.abs(s))
     u = [low, -low * x, -low * y]
     k = turned(data.product, gain)
     t, across = (coefficients(plan.retarder_first, part) for part in (k, imaginary(k)))
