@@ -15,7 +15,7 @@ from .noise import InferredNoise, KnownNoise
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .priors import AxialVonMises, Prior, TruncatedNormal, UniformAngle, VonMises
 from .records import Fit, Measurement, Parameters, Status
-from .sampling import Draws, Ensemble, Gibbs, calibration_ranks, sample
+from .sampling import Draws, Ensemble, Gibbs, calibration_ranks, sample, summarise
 from .simulation import simulate
 from .storage import save
 
@@ -61,4 +61,5 @@ __all__ = [
     "select",
     "simulate",
     "smooth_gauge",
+    "summarise",
 ]

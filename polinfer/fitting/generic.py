@@ -27,7 +27,7 @@ __all__ = ["DESIGN", "DESIGN_WARM", "Part", "Prepared", "chunk_size", "fit_chunk
 
 CHUNK = 2048  # pixels whose starting points are in memory at once
 LEAST = 64
-ITERATIONS, PATIENT = 200, 1000  # at most, from a start and from the best point found
+ITERATIONS, PATIENT = 200, 600  # at most, from a start and from the best point found
 DESIGN, DESIGN_WARM = 12, 2  # starts from the design, without and with an earlier fit
 
 

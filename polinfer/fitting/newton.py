@@ -28,7 +28,7 @@ ROUND = 6  # iterations between two looks at which lanes have finished
 LONGEST_STEP = 0.7  # radians in chart coordinates
 KICK = 0.05  # step off a saddle
 PATIENCE = 4  # steps that may lie below the best point
-FEW, MANY = 64, 1024  # numbers of lanes for which code is compiled
+LANES = 128  # problems that compiled code advances at once
 
 
 class _Place(NamedTuple):
@@ -162,14 +162,13 @@ def maximise(
     Returns the coordinates ``(problems, free)``, the log posterior and whether the iteration converged.
     """
     problems = len(points)
-    lanes = FEW if problems <= FEW else MANY
     state = _fresh(points)
     spent = np.zeros(problems, int)
     waiting = np.arange(problems)
     host = jax.tree.map(np.asarray, statistics)
     while len(waiting):
-        active, waiting = waiting[:lanes], waiting[lanes:]
-        index = np.concatenate([active, np.full(lanes - len(active), active[0])])
+        active, waiting = waiting[:LANES], waiting[LANES:]
+        index = np.concatenate([active, np.full(LANES - len(active), active[0])])
         lane = jax.tree.map(lambda x, chosen=index: x[chosen], state)
         lane.finished[len(active) :] = True
         data = jax.tree.map(lambda x, chosen=pixels[index]: x[chosen], host)

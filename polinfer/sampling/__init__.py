@@ -6,7 +6,19 @@ from .draws import Draws
 from .ensemble import Ensemble
 from .gibbs import Gibbs
 from .predictive import Predictive
+from .streaming import summarise
 from .summaries import Summary
 from .verb import sample
 
-__all__ = ["Diagnostics", "Draws", "Ensemble", "Gibbs", "Predictive", "Ranks", "Summary", "calibration_ranks", "sample"]
+__all__ = [
+    "Diagnostics",
+    "Draws",
+    "Ensemble",
+    "Gibbs",
+    "Predictive",
+    "Ranks",
+    "Summary",
+    "calibration_ranks",
+    "sample",
+    "summarise",
+]

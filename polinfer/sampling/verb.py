@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,10 +15,10 @@ from ..model import Model
 from ..records import Fit, Measurement, Parameters, Status
 from .draws import Draws
 from .ensemble import Ensemble, draw_ensemble
-from .gibbs import Gibbs, draw_gibbs
+from .gibbs import Gibbs, draw_gibbs, part_of, problem_of
 from .raw import Raw
 
-__all__ = ["sample"]
+__all__ = ["Call", "begin", "draw", "sample", "spread", "status_of"]
 
 LEAST = 4  # draws of a chain
 
@@ -70,6 +71,28 @@ def sample(
     >>> found.parameters.retardance.shape, bool(abs(found.summary().mean.retardance - 1.2) < 0.05)
     ((4, 200), True)
     """
+    call = begin(model, measurement, sampler, chains, draws, rng)
+    raw = next(draw(call, [np.arange(len(call.good))], progress))
+    return _assemble(call, raw)
+
+
+class Call(NamedTuple):
+    """A checked call: ``found`` is the fit that the chains begin at, ``good`` the flat numbers of pixels with data."""
+
+    model: Model
+    measurement: Measurement
+    sampler: Gibbs | Ensemble
+    chains: int
+    draws: int
+    seed: int
+    found: Fit
+    good: np.ndarray
+
+
+def begin(
+    model: Model, measurement: Measurement, sampler: Any, chains: int, draws: int, rng: int | np.random.Generator | None
+) -> Call:
+    """Checks the arguments of :func:`sample` and fits."""
     one_of_types("model", model, (Model,), "pass Model(...).")
     one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
     sampler = Gibbs() if sampler is None else sampler
@@ -80,22 +103,24 @@ def sample(
         seed = int(generator.integers(1 << 62))
     found = fit(model, measurement)
     good = np.flatnonzero(np.ravel(found.status & int(Status.MASKED | Status.NON_FINITE)) == 0)
-    if isinstance(sampler, Gibbs):
-        raw = _with_bar(model, measurement, found, good, sampler, chains, draws, seed, progress)
-    else:
-        raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good, found)
-        raw = raw._replace(parameters=_aligned(raw.parameters, found, good))
-    return _assemble(model, measurement, found, good, raw, sampler, seed)
+    return Call(model, measurement, sampler, chains, draws, seed, found, good)
 
 
-def _with_bar(
-    model: Model, measurement: Measurement, found: Fit, good: np.ndarray, sampler: Gibbs, chains: int, draws: int,
-    seed: int, progress: bool,
-) -> Raw:  # fmt: skip
+def draw(call: Call, parts: Iterable[np.ndarray], progress: bool) -> Iterator[Raw]:
+    """Draws of the pixels ``good[part]``, part by part."""
     from tqdm import tqdm
 
+    model, measurement, sampler, chains, draws, seed, found, good = call
+    if isinstance(sampler, Ensemble):
+        for part in parts:
+            raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good[part], found)
+            yield raw._replace(parameters=_aligned(raw.parameters, found, good[part]))
+        return
+    problem = problem_of(model, measurement, found, good)
     with tqdm(total=len(good), desc="sample", unit="pixel", disable=not progress) as bar:
-        return draw_gibbs(model, measurement, found, good, sampler, chains, draws, seed, bar.update)
+        for part in parts:
+            own = problem if len(part) == len(good) else part_of(problem, part)
+            yield draw_gibbs(own, good[part], sampler, chains, draws, seed, bar.update)
 
 
 def _aligned(parameters: Parameters, found: Fit, good: np.ndarray) -> Parameters:
@@ -104,29 +129,37 @@ def _aligned(parameters: Parameters, found: Fit, good: np.ndarray) -> Parameters
     return nearest(equivalent(found.model, Parameters(*(np.asarray(x, float) for x in parameters))), reference)
 
 
-def _assemble(
-    model: Model, measurement: Measurement, found: Fit, good: np.ndarray, raw: Raw, sampler: Any, seed: int
-) -> Draws:
-    shape, pixels = measurement.shape, int(np.prod(measurement.shape))
+def spread(values: np.ndarray, place: np.ndarray, pixels: int) -> np.ndarray:
+    """Values ``(..., part)`` at the places of ``pixels`` pixels, NaN elsewhere."""
+    if len(place) == pixels:
+        return values
+    frame = np.full((*values.shape[:-1], pixels), np.nan, values.dtype)
+    frame[..., place] = values
+    return frame
 
-    def spread(values: np.ndarray | None, dtype: Any = None) -> Any:
-        if values is None:
-            return None
-        lead = values.shape[:-1]
-        if len(good) == pixels:
-            frame = np.asarray(values, dtype)
-        else:
-            frame = np.full((*lead, pixels), np.nan, dtype or values.dtype)
-            frame[..., good] = values
-        return frame.reshape((*lead, *shape))
 
-    values = {name: spread(getattr(raw.parameters, name)) for name in Parameters._fields}
-    for name in model.dropped:
-        values[name] = np.full_like(values[name], np.nan)
+def status_of(found: Fit, place: np.ndarray, converged: np.ndarray) -> np.ndarray:
+    """Status bits of the whole frame, flat: those of the fit, and whether the chains of the pixels ``place`` agree."""
     # whether the climb to the maximum converged says nothing about the draws
     status = np.ravel(found.status).astype(np.int32) & ~int(Status.NOT_CONVERGED)
-    status[good] |= np.where(raw.converged, 0, int(Status.NOT_CONVERGED)).astype(np.int32)
+    status[place] |= np.where(converged, 0, int(Status.NOT_CONVERGED)).astype(np.int32)
+    return status
+
+
+def _assemble(call: Call, raw: Raw) -> Draws:
+    model, shape, good = call.model, call.measurement.shape, call.good
+
+    def framed(values: np.ndarray | None) -> Any:
+        if values is None:
+            return None
+        values = spread(np.asarray(values), good, int(np.prod(shape)))
+        return values.reshape((*values.shape[:-1], *shape))
+
+    values = {name: framed(getattr(raw.parameters, name)) for name in Parameters._fields}
+    for name in model.dropped:
+        values[name] = np.full_like(values[name], np.nan)
     return Draws(
-        model, measurement, Parameters(**values), spread(raw.log_evidence), spread(raw.log_evidence_error),
-        status.reshape(shape), spread(raw.gain), spread(raw.sigma), seed, sampler,
+        model, call.measurement, Parameters(**values), framed(raw.log_evidence), framed(raw.log_evidence_error),
+        status_of(call.found, good, raw.converged).reshape(shape), framed(raw.gain), framed(raw.sigma), call.seed,
+        call.sampler,
     )  # fmt: skip

@@ -31,7 +31,7 @@ from .random import begin
 from .sampler import Gibbs
 from .sweep import Observed, State
 
-__all__ = ["draw_gibbs"]
+__all__ = ["Problem", "draw_gibbs", "part_of", "problem_of"]
 
 BLOCKS, FEW = (16, 512), 128  # numbers of pixels for which code is compiled; up to FEW pixels take small ones
 BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
@@ -61,7 +61,16 @@ def _statistics(model: Model, measurement: Measurement, good: np.ndarray) -> Sta
     return found
 
 
-def _problem(known: Plan, model: Model, measurement: Measurement, fit: Fit, good: np.ndarray) -> Problem:
+def problem_of(model: Model, measurement: Measurement, fit: Fit, good: np.ndarray) -> Problem:
+    """The pixels with the flat numbers ``good`` made ready.
+
+    Raises
+    ------
+    ValueError: a model whose conditional distributions are not known.
+    """
+    known = plan(model)
+    if isinstance(known, str):
+        raise ValueError(f"model: the Gibbs sampler cannot draw from it, because {known}; use sampler=Ensemble().")
     statistics = _statistics(model, measurement, good)
     dtype = np.zeros((), jax.dtypes.canonicalize_dtype(measurement.response.dtype)).real.dtype
     lead = (len(good),)
@@ -76,6 +85,12 @@ def _problem(known: Plan, model: Model, measurement: Measurement, fit: Fit, good
         values["gain"] = np.asarray(fit.gain).reshape(-1)[good]
     usable, balanced = judge_states(np.asarray(statistics.illumination), dtype)
     return Problem(known, balanced and bool(usable.all()), statistics, values, dtype)
+
+
+def part_of(problem: Problem, part: np.ndarray) -> Problem:
+    """Some of the pixels, by their place in the problem; a frame that shares its sigma has no parts."""
+    statistics = Statistics(*(x[part] for x in problem.statistics))
+    return problem._replace(statistics=statistics, fit={name: x[part] for name, x in problem.fit.items()})
 
 
 def _elements(a: np.ndarray, dtype: np.dtype) -> Any:
@@ -245,15 +260,15 @@ def _run(
     each(block, range(0, len(pixels), size))
 
 
-def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
+def _evidence(problem: Problem, store: _Chains, count: int) -> np.ndarray:
     """Log evidence and its standard error, (2, pixels)."""
-    found = np.empty((2, len(good)))
+    found = np.empty((2, count))
     _, chains, draws, _ = store.parameters.shape
     factors = np.array([0.5, 2.0, 1.0])[:, None, None, None]
     kept = np.linspace(0, draws - 1, max(min(draws, MOST_DRAWS // chains) // 10 * 10, 10)).astype(int)
 
     def block(begin_at: int) -> None:
-        index = np.arange(begin_at, min(begin_at + EVIDENCE_BLOCK, len(good)))
+        index = np.arange(begin_at, min(begin_at + EVIDENCE_BLOCK, count))
         double = problem._replace(dtype=np.dtype(float))
         observed = _observed(double, index)
         fit = [np.nan_to_num(problem.fit[name][index]) for name in Parameters._fields]
@@ -267,34 +282,26 @@ def _evidence(problem: Problem, store: _Chains, good: np.ndarray) -> np.ndarray:
         )  # fmt: skip
         found[:, index] = log_evidence(problem.plan, given)
 
-    each(block, range(0, len(good), EVIDENCE_BLOCK))
+    each(block, range(0, count, EVIDENCE_BLOCK))
     return found
 
 
 def draw_gibbs(
-    model: Model, measurement: Measurement, fit: Fit, good: np.ndarray, sampler: Gibbs, chains: int, draws: int,
-    seed: int, done: Callable[[int], Any] = lambda _: None,
+    problem: Problem, numbers: np.ndarray, sampler: Gibbs, chains: int, draws: int, seed: int,
+    done: Callable[[int], Any] = lambda _: None,
 ) -> Raw:  # fmt: skip
-    """Draws of the pixels with the flat numbers ``good``.
-
-    Raises
-    ------
-    ValueError: a model whose conditional distributions are not known.
-    """
-    known = plan(model)
-    if isinstance(known, str):
-        raise ValueError(f"model: the Gibbs sampler cannot draw from it, because {known}; use sampler=Ensemble().")
-    problem = _problem(known, model, measurement, fit, good)
-    store = _Chains(problem, chains, draws, len(good))
+    """Draws of all pixels of a problem; ``numbers`` are their flat places in the frame, which choose random numbers."""
+    known, count = problem.plan, len(numbers)
+    store = _Chains(problem, chains, draws, count)
     invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1), jnp.ones((1, 1))))
-    store.sums = np.zeros((store.batches, 2, invariants, chains, len(good)))
-    pixels = np.arange(len(good))
+    store.sums = np.zeros((store.batches, 2, invariants, chains, count))
+    pixels = np.arange(count)
     # few draws cannot reach the number asked for, and their R-hat scatters
     enough, largest = min(sampler.effective, 0.2 * chains * draws), LARGEST_R + 2 / np.sqrt(chains * draws)
     # the number from so many batches is uncertain: twice its standard error
     surely = min(enough * (1 + 2 * (2 / (chains * store.batches)) ** 0.5), 0.25 * chains * draws)
     for attempt, more in enumerate((1, *MORE)):
-        _run(problem, store, pixels, good, chains, sampler, sampler.thin * more, seed, attempt, done)
+        _run(problem, store, pixels, numbers, chains, sampler, sampler.thin * more, seed, attempt, done)
         if known.noise == "frame":
             break
         r_hat, effective = convergence(store.sums[..., pixels], store.length)
@@ -303,8 +310,8 @@ def draw_gibbs(
             break
     r_hat, effective = convergence(store.sums, store.length)
     converged = (r_hat <= largest) & (effective >= enough)
-    evidence = np.full((2, len(good)), np.nan)
+    evidence = np.full((2, count), np.nan)
     if sampler.evidence and unavailable(known) is None:
-        evidence = _evidence(problem, store, good)
+        evidence = _evidence(problem, store, count)
     sigma = None if store.precision is None else store.precision**-0.5
     return Raw(Parameters(*store.parameters), store.gain, sigma, evidence[0], evidence[1], converged)

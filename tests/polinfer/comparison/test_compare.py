@@ -56,7 +56,7 @@ def test_the_ordering_that_made_the_data_is_found_and_the_numbers_are_those_of_t
 def test_a_transposed_matrix_has_the_reverse_ordering():
     """(A_pol A_ret)^T = A_ret(-xi) A_pol, and the prior of xi is even: the evidences change places."""
     jones = measured().response @ STATES.conj().T / 1.5
-    one, other = (compare(fitted(Measurement.from_jones(m, 0.05))) for m in (jones, jones.swapaxes(-1, -2)))
+    one, other = (compare(fitted(Measurement(STATES, m @ STATES, 0.05))) for m in (jones, jones.swapaxes(-1, -2)))
     np.testing.assert_allclose(one.log_evidence, other.log_evidence[::-1], atol=1e-6)
     assert {one.verdict, other.verdict} == set(ORDERINGS)
 
