@@ -9,6 +9,7 @@ out what a scene does not need, and finds what made it.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -128,6 +129,7 @@ def needs(results: Results, scenes: int) -> None:
         # name: the model that made the scene, the other one, D, sigma
         "diattenuation, not needed": (RETARDER, free, 0.0, 0.05),
         "diattenuation, not needed, noisy": (RETARDER, free, 0.0, 0.4),
+        "diattenuation, not needed, noisy, exact evidence": (RETARDER, free, 0.0, 0.4),
         "diattenuation, needed": (free, RETARDER, 0.3, 0.05),
         "phase, not needed": (free, replace(free, gain=PhaseGain()), 0.3, 0.05),
         "phase, needed": (replace(free, gain=PhaseGain()), free, 0.3, 0.05),
@@ -144,7 +146,8 @@ def needs(results: Results, scenes: int) -> None:
             truth = Parameters(*(x.reshape(shape) for x in each))
             made = replace(right, neighbours=None)
             data = polinfer.simulate(made, truth, states, sigma, rng=rng)
-            result = select({"right": right, "other": other}, data)
+            infer = partial(polinfer.sample, draws=400, rng=rng) if "exact" in name else polinfer.fit
+            result = select({"right": right, "other": other}, data, infer=infer)
             found.append(result.verdict)
             leads.append(result.pooled[0] - result.pooled[1])
         share, wrong = np.mean(np.array(found) == "right"), np.mean(np.array(found) == "other")

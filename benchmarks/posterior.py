@@ -3,11 +3,16 @@
 Speed: 27 x 36 pixels, three balanced states, truths from the priors; draws until every invariant of every pixel has
 1000 effective ones (4 chains; pixels that fall short are drawn again with more sweeps), counted
 apart by :meth:`polinfer.Draws.diagnostics`. Time is that of :func:`polinfer.sample` without evidence, fit
-included, compiled before. Evidence: pixels with D from 0 to the edge against the four-dimensional grid of
+included, compiled before; the same with sigma inferred in every pixel. Summaries of a large frame in parts
+(:func:`polinfer.summarise`): time a pixel, and by how much the memory of the process grows from a quarter of the
+frame to the whole. Evidence: pixels with D from 0 to the edge against the four-dimensional grid of
 :mod:`benchmarks.evidence`, with its time. Agreement: means of invariants of ``Gibbs`` and ``Ensemble``.
 """
 
 from __future__ import annotations
+
+import resource
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import kstest, norm
@@ -16,8 +21,19 @@ import polinfer
 from benchmarks import scenes
 from benchmarks.evidence import GRID, whole_quadrature
 from benchmarks.oracle import Oracle
-from benchmarks.results import Results, median_seconds, seconds
-from polinfer import ComplexGain, Ensemble, Gibbs, Model, Parameters, PolariserFirst, RetarderFirst, Status
+from benchmarks.results import Results, alternating_seconds, median_seconds, seconds
+from polinfer import (
+    ComplexGain,
+    Ensemble,
+    Gibbs,
+    InferredNoise,
+    Measurement,
+    Model,
+    Parameters,
+    PolariserFirst,
+    RetarderFirst,
+    Status,
+)
 from polinfer.sampling.invariants import invariants
 
 PIXELS, EFFECTIVE, CHAINS, DRAWS = 972, 1000, 4, 1000
@@ -49,6 +65,41 @@ def speed(results: Results, pixels: int) -> None:
             )  # fmt: skip
             if dtype == "complex64":
                 results.bar(f"{pixels} pixels, {gain} gain, sigma {sigma}", time, bar, "s")
+
+
+def noise_unknown(results: Results, pixels: int) -> None:
+    """Time with sigma inferred in every pixel, over that with sigma known."""
+    states, sigma = scenes.balanced_states(), 0.1
+    truth = scenes.from_priors(Model(), pixels, np.random.default_rng(1))
+    data = scenes.measure(Model(), truth, states, sigma, "complex64", rng=2)
+    sampler = Gibbs(effective=EFFECTIVE, evidence=False)
+
+    def run(model: Model, given: Measurement) -> polinfer.Draws:
+        return polinfer.sample(model, given, sampler, chains=CHAINS, draws=DRAWS + DRAWS // 4, rng=3)
+
+    inferred = Model(noise=InferredNoise(3.0, 0.03, "pixel"))
+    times = alternating_seconds(
+        {"known": lambda: run(Model(), data), "inferred": lambda: run(inferred, replace(data, sigma=None))}, 3
+    )
+    ratio = float(np.median(times["inferred"] / times["known"]))
+    least = run(inferred, replace(data, sigma=None)).diagnostics().ess.min(axis=-1)
+    results.add(noise="inferred", known_seconds=float(np.median(times["known"])),
+                inferred_seconds=float(np.median(times["inferred"])), least_ess=float(least.min()))  # fmt: skip
+    results.bar("time with sigma inferred over that with sigma known", ratio, 2.0)
+
+
+def stream(results: Results, pixels: int) -> None:
+    """Summaries in parts."""
+    states, peak = scenes.balanced_states(), []
+    for count in (pixels // 4, pixels):
+        truth = scenes.from_priors(Model(), count, np.random.default_rng(1))
+        data = scenes.measure(Model(), truth, states, 0.05, "complex64", rng=2)
+        time = seconds(lambda d=data: polinfer.summarise(Model(), d, draws=DRAWS // 2, rng=3))
+        peak.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+        results.add(
+            streamed=count, draws=CHAINS * DRAWS // 2, milliseconds_a_pixel=1e3 * time / count, peak_GB=peak[-1]
+        )
+    results.bar("growth of the peak memory from a quarter of the frame to the whole", peak[1] - peak[0], 0.5, "GB")
 
 
 def evidence(results: Results, sigmas: tuple[float, ...]) -> None:
@@ -96,6 +147,7 @@ def agreement(results: Results, pixels: int) -> None:
         z += list(((a - b) / np.sqrt(va + vb)).ravel())
     # means of four chains each: about Student with six degrees of freedom
     p = kstest(norm.ppf(student(np.array(z))), norm.cdf).pvalue
+    results.bar("agreement of Gibbs and Ensemble, p-value of all comparisons", float(p), 0.01, at_least=True)
     results.add(pixels=pixels, comparisons=len(z), rms_z=float(np.sqrt(np.mean(np.square(z)))), p_value=float(p))
 
 
@@ -110,6 +162,8 @@ def main(size: int | None = None, full: bool = False) -> None:
     """Print the tables."""
     results = Results("posterior")
     speed(results, size or PIXELS)
+    noise_unknown(results, size or PIXELS)
+    stream(results, 65536 if full else 16384)
     evidence(results, (0.1, 0.2, 0.4) if full else (0.4,))
     agreement(results, 50 if full else 6)
     results.save()

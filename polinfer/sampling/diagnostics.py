@@ -12,6 +12,7 @@ from .. import storage
 from ..model import Model
 from ..records import Parameters, Status
 from ..storage import array
+from ..threads import each
 from .blocks import blocks, flat, rows
 from .invariants import invariants
 
@@ -213,7 +214,10 @@ def diagnose(
     none = np.zeros((1, 1, 1))
     names = tuple(_functions(model, Parameters(*[none] * 5), *(None if x is None else none for x in extra)))
     r_hat, ess = (np.full((status.size, len(names)), np.nan) for _ in range(2))
-    for part in blocks(good, number):
+    parts = list(blocks(good, number))
+
+    def judge(index: int) -> None:
+        part = parts[index]
         values = Parameters(*(rows(x, part) for x in columns))
         stuck = np.ones(len(part), bool)
         found = _functions(model, values, *(None if x is None else rows(x, part) for x in extra))
@@ -221,4 +225,6 @@ def diagnose(
             r_hat[part, k], ess[part, k], constant = _assess(found[name])
             stuck &= constant
         r_hat[part[stuck]], ess[part[stuck]] = np.inf, 1.0
+
+    each(judge, range(len(parts)))
     return Diagnostics(r_hat.reshape(*status.shape, -1), ess.reshape(*status.shape, -1), names)

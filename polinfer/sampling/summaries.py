@@ -14,6 +14,7 @@ from ..checks import real_number
 from ..model import Model
 from ..records import PERIODS, RANGES, Parameters, Status
 from ..storage import array, setting
+from ..threads import each
 from .blocks import blocks, flat, rows
 from .diagnostics import NO_DRAWS, diagnose
 
@@ -212,11 +213,16 @@ def summarise_draws(
     for name in model.free:
         draws = flat(getattr(parameters, name))
         period = getattr(PERIODS, name)
-        for block in blocks(good, draws.shape[0] * draws.shape[1]):
+        some = list(blocks(good, draws.shape[0] * draws.shape[1]))
+
+        def work(index: int, name: str = name, draws: Any = draws, period: float = period, some: Any = some) -> None:
+            block = some[index]
             x = rows(draws, block).reshape(len(block), -1)
             parts["mean"][name][block], parts["std"][name][block] = circular_mean_and_std(x, period)
             ends = highest_density(x, inf if _line(model, name) else period, level)
             parts["low"][name][block], parts["high"][name][block] = ends
+
+        each(work, range(len(some)))
     made = {part: Parameters(**{name: x.reshape(status.shape) for name, x in values.items()})
             for part, values in parts.items()}  # fmt: skip
     told = diagnose(model, parameters, gain, sigma, status)
