@@ -14,7 +14,7 @@ from ..model import Model
 from ..noise import InferredNoise, KnownNoise
 from ..records import Fit, Measurement, Parameters, Status
 from ..statistics import Statistics, least_squares_jones
-from .fast import fast_scene, fit_part, fit_responses
+from .fast import fast_scene, fit_part, fit_responses, judge_states
 from .frame_noise import Search, first_guess
 from .generic import DESIGN, DESIGN_WARM, Part, Prepared, chunk_size, fit_chunk, prepare
 from .residuals import BAD_FIT_PROBABILITY, tail_probability
@@ -84,8 +84,36 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
         earlier = Parameters(*(np.asarray(x).reshape(-1) for x in start.parameters))
     if isinstance(model.noise, InferredNoise) and not model.noise.integrated:
         return _fit_frame(model, model.noise, measurement, earlier, progress)
+    if isinstance(model.noise, InferredNoise) and earlier is None:
+        likely = _at_likely_sigma(model, model.noise, measurement)
+        if likely is not None:
+            prepared = prepare(model, measurement, True)
+            # few pixels have a second maximum, more where the states are unbalanced
+            design = None if judge_states(prepared.pooled.own.illumination, np.dtype(np.float32))[1] else DESIGN_WARM
+            parts = list(_parts(prepared, likely, design, progress))
+            return _assemble(model, prepared, None, parts, False)
     found = fit_responses(model, measurement, earlier, progress, partial(_fit_general, fast=False))
     return _fit_general(model, measurement, earlier, progress) if found is None else found
+
+
+def _at_likely_sigma(model: Model, noise: InferredNoise, measurement: Measurement) -> Parameters | None:
+    """Where to start if every pixel has an unknown sigma: the fast route at likely ones; None if it cannot be had."""
+    given = replace(model, noise=KnownNoise())
+    if model.neighbours is not None or fast_scene(given) is None:
+        return None
+    noise.refuse(measurement)
+    own = prepare(given, replace(measurement, sigma=np.ones(())), True).pooled.own
+    count = np.asarray(own.count, float).reshape(measurement.shape)
+    # rather too small at first: what a large one explains by noise is hard to win back
+    misfit, fitted, found = np.asarray(own.residual, float).reshape(measurement.shape), 0.0, None
+    for _ in range(2):
+        variance = (noise.scale + misfit) / (noise.shape + np.maximum(count - 0.5 * fitted, 0))
+        sigma = np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
+        found = fit(given, replace(measurement, sigma=sigma), found)
+        misfit, fitted = 0.5 * found.chi_square * sigma**2, float(len(model.free))
+    assert found is not None
+    values = (np.asarray(x).reshape(-1) for x in found.parameters)
+    return Parameters(*(np.where(np.isfinite(x), x, x.dtype.type(0.1)) for x in values))
 
 
 def _fit_general(

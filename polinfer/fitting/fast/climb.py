@@ -25,7 +25,6 @@ __all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "froz
 LONGEST_STEP = 0.7  # radians of any angle y
 LEAST_CURVATURE = 1e-6  # of a direction of which neither data nor prior say anything
 ROOT_HALF = 0.5**0.5
-PATIENCE = 4  # steps that may lie below the best point
 
 
 class Posterior(NamedTuple):
@@ -165,10 +164,12 @@ def better_copy(scene: Scene, point: Point) -> Point:
     return best
 
 
-def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any, exchange: Any = True) -> Point:
+def climb(
+    scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any, exchange: Any = True, patience: Any = 0
+) -> Point:
     """At most ``iterations`` damped Newton steps uphill; the best point that they reach.
 
-    A step that lowers the density is taken if one of the next ``PATIENCE`` comes out higher, else taken back. With
+    A step that lowers the density is taken back, unless one of the next ``patience`` comes out higher. With
     ``exchange`` a point gives way to an equivalent one with a higher prior on the way.
     """
 
@@ -205,7 +206,7 @@ def climb(scene: Scene, balanced: bool, data: Data, point: Point, iterations: An
         new = evaluate(scene, data, trial)[0] / data.one
         accept = (new >= value - rounding) & ~done
         # along a narrow curved valley of misfit the way leads over its side, if the next steps come out higher
-        astray = ~accept & jnp.isfinite(new) & (age < PATIENCE)
+        astray = ~accept & jnp.isfinite(new) & (age < patience)
         failed = ~accept & ~astray
         damping = jnp.where(accept, 0.1 * damping, jnp.where(failed, jnp.maximum(10 * damping, 1e-2), damping))
         damping = jnp.where(damping < 1e-3, 0.0, damping)

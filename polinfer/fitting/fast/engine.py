@@ -24,7 +24,7 @@ from .scene import Scene
 __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
 
 BLOCKS = (1024, 4096)  # numbers of pixels for which code is compiled
-FIRST, MOST, PATIENT = 3, 60, 500  # Newton steps of the first pass, of the others, and of the last
+FIRST, MOST, LAST = 3, 60, 500  # Newton steps of the first pass, of the others, and of the last
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def solve_frame(
         told = pairs_of(earlier, frame.dtype)
         finite = np.isfinite(told).all(axis=0)
         again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
-    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points], iterations=PATIENT)
+    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points], kernel.PATIENT, LAST)
     return out, flags
 
 

@@ -25,7 +25,7 @@ from .engine import Frame, Responses, Summed, solve_frame
 from .kernel import Shared
 from .scene import Scene, scene
 
-__all__ = ["fast_scene", "fit_part", "fit_responses"]
+__all__ = ["fast_scene", "fit_part", "fit_responses", "judge_states"]
 
 # below this ratio of the singular values of U the data are nearly those of one state, and the closed form says little
 LEAST_RATIO = 1e-3

@@ -17,10 +17,12 @@ from .point import Point
 from .scene import Scene
 from .start import closed_form
 
-__all__ = ["CLOSED_FORM", "GIVEN", "STAY", "Shared", "from_responses", "from_statistics", "no_start"]
+__all__ = ["CLOSED_FORM", "GIVEN", "PATIENT", "STAY", "Shared", "from_responses", "from_statistics", "no_start"]
 
-# where a climb starts: in the closed form, or in a point that is given; and whether it may change to another copy of it
-CLOSED_FORM, GIVEN, STAY = range(3)
+# where a climb starts: in the closed form, or in a point that is given; whether it may change to another copy of it;
+# and whether it is patient, which narrow curved valleys need, but which may lead to another maximum
+CLOSED_FORM, GIVEN, STAY, PATIENT = range(4)
+PATIENCE = 4
 
 
 class Shared(NamedTuple):
@@ -49,7 +51,8 @@ def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, it
         *((start[2 * i], start[2 * i + 1]) if known is None else closed[i] for i, known in enumerate(scene.fixed))
     )
     point = jax.tree.map(partial(jnp.where, given != CLOSED_FORM), told, closed)
-    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations, given != STAY))
+    patience = jnp.where(given == PATIENT, PATIENCE, 0)
+    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations, given != STAY, patience))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
