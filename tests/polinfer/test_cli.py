@@ -36,6 +36,24 @@ def test_fit_writes_the_same_result_as_the_library_and_a_picture(measurement, tm
     np.testing.assert_array_equal(polinfer.load(out).parameters.retardance, expected.parameters.retardance)
 
 
+def test_sample_writes_the_draws_of_the_library_and_says_what_they_hold(measurement, tmp_path):
+    out, picture = tmp_path / "draws.nc", tmp_path / "posterior.png"
+    sizes = ("--chains", "2", "--draws", "40", "--seed", "3")
+    result = run("sample", measurement, out, *SHARED, *sizes, "--picture", picture, "--no-progress")
+    assert result.exit_code == 0, result.output
+    assert "seed 3; 2 chains of 40 draws; 20 pixels" in result.output
+    assert "log evidence: sum" in result.output
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    model = Model(PolariserFirst(), gain=ComplexGain(0.8))
+    expected = polinfer.sample(model, polinfer.load(measurement), chains=2, draws=40, rng=3)
+    found = polinfer.load(out)
+    np.testing.assert_array_equal(found.parameters.retardance, expected.parameters.retardance)
+    np.testing.assert_array_equal(found.log_evidence, expected.log_evidence)
+    again = run("sample", measurement, out, *SHARED)
+    assert again.exit_code != 0
+    assert "exists" in again.output
+
+
 def declared(monkeypatch, measurement, out, *options):
     """The model and the data that the command hands to ``fit``; nothing is fitted."""
     seen = []

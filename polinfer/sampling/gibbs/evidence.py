@@ -22,7 +22,7 @@ from .plan import Any1D, Plan, conjugate, normal
 
 __all__ = ["Given", "log_evidence", "unavailable"]
 
-MOST_DRAWS = 2000  # of which the denominator is averaged
+MOST_DRAWS = 4000  # of which the denominator is averaged
 NODES = 28  # for the integral over D on either side of 0
 GRIDS = ((16, 24), (32, 48))  # numbers of nodes in each direction: compared, and larger where they differ
 CLOSE = 1e-3  # nat
