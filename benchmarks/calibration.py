@@ -51,7 +51,7 @@ def main(size: int | None = None) -> None:
     bound = 1.63 / (size or SIMULATIONS) ** 0.5
     axes.axhspan(-bound, bound, color="0.9", zorder=0)
     axes.set(xlabel="rank of the truth", ylabel="share of smaller ranks, less the rank",
-             title="each line one function of the parameters; grey: 99 % of a line's largest departure")  # fmt: skip
+             title="lines: functions of the parameters; grey: 99 % of their departures")  # fmt: skip
     results.bar("smallest p-value, times the number of tests", smallest * tests, 0.01, at_least=True)
     results.bar("coverage, mean over the functions, off by at most", off, 2.0, "points")
     results.save(figure)
