@@ -16,7 +16,7 @@ from ...statistics import Statistics
 from ...threads import each
 from . import kernel
 from .climb import moved
-from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROWS, WIDE, rows
+from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROUGH, ROWS, WIDE, rows
 from .point import Point
 from .priors import COPIES, FACTORS
 from .scene import Scene
@@ -180,7 +180,7 @@ def solve_frame(
         told = pairs_of(earlier, frame.dtype)
         finite = np.isfinite(told).all(axis=0)
         again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
-    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points], kernel.PATIENT, LAST)
+    again((flags & (CONVERGED | NON_FINITE | ROUGH)) == 0, lambda points, _: [points], kernel.PATIENT, LAST)
     return out, flags
 
 
