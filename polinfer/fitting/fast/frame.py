@@ -35,11 +35,15 @@ BALANCED = {np.dtype(np.float64): 1e-11, np.dtype(np.float32): 1e-6}
 
 
 class Solved(NamedTuple):
-    """Rows of the result ``(rows, pixels)``, and which pixels have no answer yet."""
+    """Rows of the result ``(rows, pixels)``, and which pixels have no answer yet.
+
+    ``rough`` are those whose widths double precision cannot tell.
+    """
 
     rows: np.ndarray
     edge: np.ndarray
     lost: np.ndarray
+    rough: np.ndarray
 
 
 def _real_type(values: np.ndarray) -> np.dtype:
@@ -107,7 +111,10 @@ def solve(
     told = np.isfinite(rows[ROWS["log_evidence"]])
     for row in rows[ROWS["std"]]:
         told &= np.isfinite(row)
-    return Solved(rows, edge, (flags & CONVERGED == 0) | (flags & (NON_FINITE | ROUGH) != 0) | ~told)
+    failed, rough = (flags & NON_FINITE != 0) | ~told, (flags & ROUGH != 0)
+    if rows.dtype == np.float32:
+        return Solved(rows, edge, failed | rough | (flags & CONVERGED == 0), np.zeros_like(rough))
+    return Solved(rows, edge, failed | (~rough & (flags & CONVERGED == 0)), rough)
 
 
 def on_bounds(model: Model, rows: np.ndarray) -> np.ndarray:
@@ -119,9 +126,11 @@ def on_bounds(model: Model, rows: np.ndarray) -> np.ndarray:
     return found
 
 
-def status_of(model: Model, rows: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """Status bits that follow from the rows: bounds (``edge``: a slope leads there), and what is not identified."""
-    status = np.where(edge | on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
+def status_of(model: Model, solved: Solved) -> np.ndarray:
+    """Status bits that follow from the rows: bounds, what is not identified, and what is lost in rounding."""
+    rows = solved.rows
+    status = np.where(solved.edge | on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
+    status |= np.where(solved.rough, np.int32(Status.NOT_CONVERGED), np.int32(0))
     for name in model.free:
         std = rows[5 + Parameters._fields.index(name)]
         status |= np.where(std > 0.5 * uniform_std(name), np.int32(Status.unidentified(name)), np.int32(0))
@@ -153,7 +162,7 @@ def _fit_statistics(
     if not usable.any():
         return _fit_general(prepared, chosen, earlier, frame.dtype)
     solved = solve(known, frame, earlier)
-    rows, status = solved.rows, status_of(model, solved.rows, solved.edge)
+    rows, status = solved.rows, status_of(model, solved)
     values = {name: rows[i] for i, name in enumerate(Parameters._fields)}
     values |= {name: rows[ROWS[name]] for name in ("log_posterior", "log_evidence", "chi_square")}
     for name in model.dropped:
@@ -251,7 +260,7 @@ def fit_responses(
         known_start = Parameters(*(np.asarray(x) if good is None else np.asarray(x)[good] for x in earlier))
     with bar(frame.pixels, progress) as done:
         solved = solve(known, frame, known_start, done)
-    rows, status = solved.rows, status_of(model, solved.rows, solved.edge)
+    rows, status = solved.rows, status_of(model, solved)
     degrees = max(2 * int(frame.shared.count) - len(model.free) - model.known_gain.real_parameters, 0)
     if degrees:
         worst = 2 * gammainccinv(0.5 * degrees, BAD_FIT_PROBABILITY)
