@@ -197,7 +197,7 @@ def solve_frame(
         again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
     if scene.likelihood.free_phase and scene.free == (0, 1, 2, 3, 4):
         open_turn = ((flags & (WIDE | NON_FINITE)) == WIDE) & (np.abs(out[0]) > POLARISER)
-        again(open_turn, lambda points, _: [turned(scene, points, alpha).astype(frame.dtype) for alpha in TURNS])
+        again(open_turn, partial(_turns, scene, frame))
     if frame.dtype == np.float64 and scene.free == (0, 1, 2, 3, 4):
         left = ((flags & CONVERGED) == 0) | ((flags & ROUGH) != 0)
         again(left & (flags & NON_FINITE == 0), partial(_along_ridges, scene, frame), kernel.STAY, 0)
@@ -205,13 +205,19 @@ def solve_frame(
     return out, flags
 
 
+def _turns(scene: Scene, frame: Frame, points: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+    """The same retarders turned about the axis of the diattenuator."""
+    strength = np.sqrt(np.sum(np.abs(frame.reduced(index)[1]) ** 2, axis=(-1, -2)))
+    return [turned(scene, points, alpha, strength).astype(frame.dtype) for alpha in TURNS]
+
+
 def _along_ridges(scene: Scene, frame: Frame, points: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
     """The best of the maxima that following the ridges leads to."""
     illumination, response = frame.reduced(index)
     illumination = np.broadcast_to(illumination, response.shape)
     best, top, _ = follow(scene, illumination, response, points)
-    for alpha in TURNS if scene.likelihood.free_phase else []:
-        found, value, _ = follow(scene, illumination, response, turned(scene, points, alpha))
+    for begun in _turns(scene, frame, points, index) if scene.likelihood.free_phase else []:
+        found, value, _ = follow(scene, illumination, response, begun)
         better = value > top + 1e-9
         best, top = np.where(better, found, best), np.where(better, value, top)
     return [best]

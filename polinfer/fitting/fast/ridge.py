@@ -266,11 +266,18 @@ def _pairs(scene: Scene, place: _Place) -> np.ndarray:
     return np.concatenate([np.stack(pair) for pair in _point(scene, place)])
 
 
-def turned(scene: Scene, points: np.ndarray, alpha: float) -> np.ndarray:
-    """Points ``(10, pixels)`` with the retarder turned by ``alpha`` about the axis of the diattenuator."""
+def turned(scene: Scene, points: np.ndarray, alpha: float, strength: np.ndarray) -> np.ndarray:
+    """Points ``(10, pixels)`` with the retarder turned by ``alpha`` about the axis of the diattenuator.
+
+    ``|D| = 1`` would say nothing of this angle: D is set off its bound by the noise, at a signal-to-noise ratio of
+    ``strength`` (pixels).
+    """
     place = _place(scene, points)
-    axis = np.where(place.pairs[:, 0, 1] < 0, -1.0, 1.0)[:, None] * place.pairs[:, 1]
+    sign = np.where(place.pairs[:, 0, 1] < 0, -1.0, 1.0)
+    axis = sign[:, None] * place.pairs[:, 1]
     step = np.concatenate([np.zeros_like(axis), alpha * axis, np.zeros_like(axis[:, :1])], axis=1)
+    angle = np.abs(np.arctan2(place.pairs[:, 0, 1], place.pairs[:, 0, 0]))
+    step[:, 0] = sign * np.minimum(0.25 * np.pi - 1 / np.maximum(strength, 10) - angle, 0)
     return _pairs(scene, _moved(scene, place, step))
 
 
