@@ -178,9 +178,11 @@ def _fit_statistics(
     part = Part(values, covariance, status)
 
     def replace_by(found: Part, where: np.ndarray) -> None:
-        for name, value in found.values.items():
-            values[name][where] = value
+        with np.errstate(over="ignore"):
+            for name, value in found.values.items():
+                values[name][where] = value
         covariance[where], status[where] = found.covariance, found.status
+        status[where] |= _overflowed(values["log_posterior"][where])
 
     def told(where: np.ndarray) -> Parameters | None:
         return None if earlier is None else Parameters(*(x[where] for x in earlier))
@@ -197,6 +199,11 @@ def _fit_statistics(
     return part
 
 
+def _overflowed(log_posterior: np.ndarray) -> np.ndarray:
+    """Status bit of densities that the precision of the result cannot hold."""
+    return np.where(np.isfinite(log_posterior), np.int32(0), np.int32(Status.NOT_CONVERGED))
+
+
 def _fit_general(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None, dtype: np.dtype) -> Part:
     """Pixels that the general route has to take: in double precision, results in that of ``dtype``."""
     size, parts, model = chunk_size(prepared.model), [], prepared.model
@@ -207,9 +214,10 @@ def _fit_general(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | N
             design = DESIGN if told is None else DESIGN_WARM
             parts.append(fit_chunk(prepared, chosen[some], told, design, np.dtype(np.complex128)))
     values = {name: np.concatenate([part.values[name] for part in parts]) for name in parts[0].values}
-    for name, value in values.items():
-        values[name] = value.astype(np.result_type(dtype, np.complex64) if np.iscomplexobj(value) else dtype)
-    status = np.concatenate([part.status for part in parts])
+    with np.errstate(over="ignore"):
+        for name, value in values.items():
+            values[name] = value.astype(np.result_type(dtype, np.complex64) if np.iscomplexobj(value) else dtype)
+    status = np.concatenate([part.status for part in parts]) | _overflowed(values["log_posterior"])
     found = np.stack([values[name] for name in Parameters._fields])
     status |= np.where(on_bounds(model, found), np.int32(Status.AT_EDGE), np.int32(0))
     return Part(values, np.concatenate([part.covariance for part in parts]).astype(dtype), status)
@@ -299,11 +307,12 @@ def _fill_in(
     rows[ROWS["parameters"], lost] = np.stack(list(found.parameters))
     rows[ROWS["std"], lost] = np.stack(list(found.std))
     rows[ROWS["covariance"], lost] = found.covariance.reshape(-1, 25).T
-    for name in ("log_posterior", "log_evidence", "chi_square"):
-        rows[ROWS[name], lost] = getattr(found, name)
-    if found.gain is not None:
-        rows[ROWS["gain_real"], lost], rows[ROWS["gain_imaginary"], lost] = found.gain.real, found.gain.imag
-    status[lost] = found.status
+    with np.errstate(over="ignore"):
+        for name in ("log_posterior", "log_evidence", "chi_square"):
+            rows[ROWS[name], lost] = getattr(found, name)
+        if found.gain is not None:
+            rows[ROWS["gain_real"], lost], rows[ROWS["gain_imaginary"], lost] = found.gain.real, found.gain.imag
+    status[lost] = found.status | _overflowed(rows[ROWS["log_posterior"], lost])
     status |= np.where(on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
 
 

@@ -30,6 +30,7 @@ TOLERANCE = 1e-10  # squared Newton decrement
 LONGEST = 0.7  # radians
 FLOOR = 1e-12  # of the curvature of an unknown, relative
 ANGLES = 5
+LARGEST = 1e30  # signal-to-noise ratio: squares of squares must not overflow
 
 
 class _Place(NamedTuple):
@@ -349,10 +350,11 @@ def follow(
     place = _with_gain(scene, illumination, response, _place(scene, points))
     system = _system(scene, illumination, response, place)
     pixels = points.shape[1]
-    damping, arrived, active = np.zeros(pixels), np.zeros(pixels, bool), np.arange(pixels)
+    damping, arrived = np.zeros(pixels), np.zeros(pixels, bool)
     scale = np.sqrt(np.sum(np.abs(response) ** 2, axis=(-1, -2)))
+    active = np.flatnonzero(np.isfinite(system.value) & (scale < LARGEST))
     slack = 10 * np.finfo(float).eps * (1 + scale) * np.sqrt(1 + np.sum(system.residual**2, axis=-1))
-    for _ in range(STEPS):
+    for _ in range(STEPS if len(active) else 0):
         here = _Place(*(x[active] for x in place))
         now = _System(*(x[active] for x in system))
         gradient = now.slope[:, 0] - 2 * np.einsum("pr,pr->p", now.first[:, :, 0], now.residual)
