@@ -16,29 +16,25 @@ def run_sums(values: np.ndarray, length: int, step: int, spare: np.ndarray) -> n
 
     Parameters
     ----------
-    values: any type that adds, shape (n,). length: >= 1. step: >= 1, ``(length - 1) * step < n``.
-    spare: shape (3, n) of the same type, overwritten. The result is the beginning of ``spare[0]`` for odd lengths from
-        3, and a view of ``spare`` or ``values`` for others.
+    values: any type that adds, shape (n,). length: odd, >= 1. step: >= 1, ``(length - 1) * step < n``.
+    spare: shape (3, n) of the same type, overwritten. The result is the beginning of ``spare[0]``, or of ``values`` if
+        length is 1.
 
     >>> run_sums(np.arange(8.0), 3, 2, np.empty((3, 8))).tolist()
     [6.0, 9.0, 12.0, 15.0]
     """
     size = len(values) - (length - 1) * step
-    # total holds the sums of the lowest bits of length, double those of the next power of two
-    total, reach = (values, 1) if length & 1 else (None, 0)
-    double, power = values, 1
+    # total: sums as long as the lowest bits of length say; doubled: as long as the next power of two
+    total, reach = values, 1
+    doubled, power = values, 1
     here, there = spare[1], spare[2]
     while 2 * power <= length:
-        left = len(double) - power * step
-        double = np.add(double[:left], double[power * step :], out=here[:left])
+        left = len(doubled) - power * step
+        doubled = np.add(doubled[:left], doubled[power * step :], out=here[:left])
         here, there = there, here
         power *= 2
         if length & power:
-            if total is None:
-                total = double
-            else:
-                left = min(len(total), len(double) - reach * step)
-                total = np.add(total[:left], double[reach * step : reach * step + left], out=spare[0][:left])
+            left = len(doubled) - reach * step
+            total = np.add(total[:left], doubled[reach * step :], out=spare[0][:left])
             reach += power
-    assert total is not None
     return total[:size]

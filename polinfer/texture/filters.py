@@ -121,7 +121,7 @@ def entropy(
     Returns
     -------
     shape of an image, every ``stride``-th row and column. NaN where the window has too few pixels or the data do not
-    determine the fit; minus infinity where the pixels lie on a line, two images being equal, for instance.
+    determine the fit; minus infinity where an image is constant, or noise explains all of its dispersion.
 
     Raises
     ------

@@ -21,8 +21,8 @@ class Joint(ABC):
     Statistics are real trigonometric polynomials, of degree 1 in every angle, written as Fourier series: frequency k
     to the coefficient of ``e^{i k.x}``. They refer to angles from which the mean directions were subtracted.
 
-    ``singular`` is what the parameters are where the pixels do not determine them: infinite if that happens only on a
-    line of the torus, where the density has no bound, NaN if it may happen elsewhere.
+    ``singular`` is what the parameters are where the pixels do not determine them: infinite if that happens only where
+    they lie on a line, so that the density has no bound, NaN if it may happen elsewhere.
     """
 
     singular: float = np.nan

@@ -27,7 +27,8 @@ def plot_texture(textures: dict[str, Texture], pixel_size: float | None = None) 
 
     Parameters
     ----------
-    textures: by the name that is written above the maps. pixel_size: side of a pixel, metres, > 0, for a scale bar.
+    textures: by the name that is written above the maps, which may be empty. pixel_size: side of a pixel, metres, > 0,
+        for a scale bar.
 
     Raises
     ------
@@ -45,17 +46,18 @@ def plot_texture(textures: dict[str, Texture], pixel_size: float | None = None) 
     figure, axes = two_rows(next(iter(textures.values())).entropy, len(textures), pixel_size)
     hatched = False
     for (name, texture), (above, below) in zip(textures.items(), axes.T, strict=True):
-        title = name.replace("_", " ")
+        words = name.replace("_", " ")
+        mean_title, entropy_title = (f"E({words})", f"H({words})") if words else ("expectation", "entropy")
         lost = np.isnan(texture.entropy)
         hatched = hatched or bool(lost.any())
         angle = texture.distribution if isinstance(texture.distribution, Angle) else None
         mean = texture.expectation if angle is None else np.degrees(texture.expectation)
         unit, period = ("", None) if angle is None else (" (°)", float(np.degrees(angle.period)))
-        draw_map(above, f"E({title}){unit}", mean, lost | np.isnan(mean), period, pixel_size=pixel_size)
+        draw_map(above, mean_title + unit, mean, lost | np.isnan(mean), period, pixel_size=pixel_size)
         entropy = texture.entropy
         finite = np.isfinite(entropy)
         lowest = entropy[finite].min() if finite.any() else 0.0
-        draw_map(below, f"H({title}) (nat)", np.where(lost, lowest, np.maximum(entropy, lowest)), lost,
+        draw_map(below, f"{entropy_title} (nat)", np.where(lost, lowest, np.maximum(entropy, lowest)), lost,
                  pixel_size=pixel_size)  # fmt: skip
     explain(figure, False, hatched, False)
     return figure
