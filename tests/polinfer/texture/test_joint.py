@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polinfer import AxialVonMises, TruncatedNormal, VonMises, texture
-from polinfer.texture import MultivariateVonMises, Rescaled, TorusGraph
+from polinfer.texture import MultivariateVonMises, Rescaled, TorusGraph, quadrature
 from polinfer.texture.joint import score_matching, terms
 from polinfer.texture.joint_frames import _correction
 from polinfer.texture.quadrature import joint_entropy
@@ -52,6 +52,19 @@ def test_score_matching_finds_the_parameters_of_exact_moments(model, angles, nod
     assert not point[0]
     assert not singular[0]
     np.testing.assert_allclose(found[0], parameters, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
+def test_sampling_agrees_with_the_grid(model, monkeypatch):
+    """Within five of the standard errors that 16,384 draws have."""
+    rng = np.random.default_rng(11)
+    angles = 3
+    parameters = rng.normal(size=(4, len(model.statistics(angles))))
+    parameters[:2, :angles] += 6
+    resultants = np.array([[0.9] * angles] * 2 + [[0.4] * angles] * 2)
+    grid = joint_entropy(model, parameters, resultants)
+    monkeypatch.setattr(quadrature, "MOST_NODES", 0)
+    np.testing.assert_allclose(joint_entropy(model, parameters, resultants), grid, atol=0.1)
 
 
 def pairs(rng, shape, spread=0.5):
