@@ -28,6 +28,11 @@ def test_one_pixel(tmp_path):
     assert isinstance(polinfer.load(tmp_path / "one_pixel.nc"), polinfer.Fit)
 
 
+def test_texture(tmp_path):
+    assert "noise taken out" in run("04_texture.py", tmp_path)
+    assert isinstance(polinfer.load(tmp_path / "texture.nc"), polinfer.texture.FitTexture)
+
+
 def test_measured_fibre(tmp_path):
     fibre_folder()
     assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)
