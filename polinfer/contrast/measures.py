@@ -138,9 +138,9 @@ def gcnr(
 
     Returns
     -------
-    Contrast. Where fewer than 5 independent pixels (as far as those of a unit are) are decided wrongly, ``low`` is what
-    the bounds of Clopper and Pearson for both shares of errors leave; without an error, ``high`` is 1. Where a region
-    lies in a single unit there is no interval, and the value is that of the bins' own decision.
+    Contrast. Where hardly any pixel is decided wrongly (less than two independent ones, as far as those of a unit are),
+    ``low`` is what the bounds of Clopper and Pearson on both shares of errors leave; without an error ``high`` is 1.
+    Where a region lies in a single unit there is no interval, and the value is that of the bins' own decision.
 
     Raises
     ------

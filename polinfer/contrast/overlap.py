@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.special import betaincinv, ndtr, ndtri, stdtrit
+from scipy.special import betaincinv, ndtr, ndtri
 
 from .bootstrap import Estimates, jackknife, symmetric_interval
 from .units import Regions
@@ -13,7 +13,7 @@ __all__ = ["Overlap"]
 
 BINS = 32
 WIDTH = 1.5  # of the smoothing, bins
-FEW = 5.0  # errors, below which their share is no normal variable
+FEW = 2.0  # independent errors, below which their share is far from a normal variable
 HIGHEST = 0.9998  # beyond it the scale is cut off
 
 
@@ -28,9 +28,8 @@ class Overlap:
     is the estimate. Its scale is that of the distance of two normal densities, ``2 Phi^-1((1 + g) / 2)``.
 
     Where hardly any pixel is decided wrongly, a bootstrap sees too little of what might happen, and the low end is that
-    of the shares of errors, with as many independent pixels as the differences between units leave.
-
-    Source of the latter: E. L. Korn and B. I. Graubard, Survey Methodology 24, 193 (1998).
+    of the shares of errors, with as many independent pixels as the likeness of those of a unit leaves (after E. L. Korn
+    and B. I. Graubard, Survey Methodology 24, 193 (1998)).
     """
 
     def __init__(self, regions: Regions, period: float | None) -> None:
@@ -101,12 +100,13 @@ class Overlap:
         low, high = (float(2 * ndtr(0.5 * x) - 1) for x in symmetric_interval(self, weights, level))
         if area[0] <= self.by_chance(weights, level):
             low = 0.0
-        numbers, errors = self.effective_errors(level)
+        numbers, errors = self.effective_pixels(), self.errors()
         if np.any(numbers * errors < FEW):
-            # the bound of Clopper and Pearson for each region
-            most = betaincinv(numbers * errors + 1, np.maximum(numbers * (1 - errors), 1e-9), 1 - 0.25 * (1 - level))
+            # Clopper and Pearson's bounds, each at the level at which the sum of two equal normal shares has its own
+            one = ndtr(ndtri(0.5 * (1 + level)) / np.sqrt(2))
+            most = betaincinv(numbers * errors + 1, np.maximum(numbers * (1 - errors), 1e-9), one)
             low = float(np.fmin(low, 1 - most.sum()))
-            high = 1.0 if np.isnan(high) or not errors.any() else high
+            high = high if errors.any() else 1.0
         # a high end beyond the cut of the scale may be anything up to 1
         return max(low, 0.0), 1.0 if high >= HIGHEST else max(high, 0.0)
 
@@ -118,20 +118,30 @@ class Overlap:
         units = int(self.regions.held.sum(axis=0).min())
         return float(np.quantile(area, level)) * np.sqrt(units / (units - 1))  # resamples vary less than samples
 
-    def effective_errors(self, level: float) -> tuple[np.ndarray, np.ndarray]:
-        """For each region: as how many independent pixels its pixels count, and the share decided wrongly by others.
-
-        A share e of n independent pixels has the variance e (1 - e) / n; with the variance that the units show, this is
-        n, corrected for how well few units know their variance. Without an error, units count as one each.
-        """
+    def errors(self) -> np.ndarray:
+        """Share of each region's pixels that the other units decide wrongly."""
         decision = np.sign(self._excess(self.counts.sum(axis=0) - self.counts) @ self.smooth.T)
-        pixels, units = np.array(self.regions.pixels), self.regions.held.sum(axis=0)
-        wrong = np.stack([0.5 * self.counts[:, r] * (1 - (1, -1)[r] * decision) for r in (0, 1)], axis=1).sum(axis=-1)
-        errors = wrong.sum(axis=0) / pixels
-        apart = wrong - errors * self.counts.sum(axis=-1)
-        variance = units / (units - 1) * (apart**2).sum(axis=0) / pixels**2
-        tail = 0.5 * (1 + level)
-        few = (stdtrit(pixels - 1, tail) / stdtrit(units - 1, tail)) ** 2
+        signs = np.array([1, -1])[:, None]
+        wrong = 0.5 * self.counts * (1 - signs * decision[:, None])
+        return np.asarray(wrong.sum(axis=(0, 2)) / self.regions.pixels)
+
+    def effective_pixels(self) -> np.ndarray:
+        """As how many independent pixels those of each region count: ``n / (1 + (m - 1) c)``, between units and pixels.
+
+        c is the correlation of two pixels of the same unit (of the places of their bins, by analysis of variance), and
+        m the pixels of a unit. Errors themselves, if they are rare, tell too little of how they are grouped.
+        """
+        pixels, units = np.array(self.regions.pixels, float), self.regions.held.sum(axis=0)
+        if self.regions.independent:
+            return pixels
+        size = self.counts.sum(axis=-1)  # (unit, region)
+        place = np.arange(self.counts.shape[-1])
+        first, second = self.counts @ place, self.counts @ place**2
         with np.errstate(divide="ignore", invalid="ignore"):
-            numbers = np.where(variance > 0, few * errors * (1 - errors) / variance, units)
-        return (pixels if self.regions.independent else np.minimum(numbers, pixels)), errors
+            own = np.where(size > 0, first**2 / size, 0.0)
+            within = (second - own).sum(axis=0) / (pixels - units)
+            between = (own.sum(axis=0) - first.sum(axis=0) ** 2 / pixels) / (units - 1)
+            typical = (pixels - (size**2).sum(axis=0) / pixels) / (units - 1)
+            correlation = (between - within) / (between + (typical - 1) * within)
+            numbers = pixels / (1 + (typical - 1) * correlation)
+        return np.asarray(np.clip(np.nan_to_num(numbers, nan=0.0), units, pixels))
