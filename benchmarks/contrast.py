@@ -3,9 +3,9 @@
 Two regions with normal values, so that the truths are known: CNR, and gCNR = 2 Phi(CNR / sqrt 2) - 1.
 
 - independent: pixels that are, ``samples`` not given;
-- samples: as the paper's, 9 of which 6 have a lesion, or 20; both regions of a sample have a common normal deviate, each
-  region one of its own, and each pixel one. Their spreads go from nearly independent pixels to samples within which
-  hardly anything varies. Beside it the percentile interval of the same bootstrap, which is not used;
+- samples: as the paper's, 9 of which 6 have a lesion, or 20; both regions of a sample have a common normal deviate,
+  each region one of its own, and each pixel one. Their spreads go from nearly independent pixels to samples within
+  which hardly anything varies. Beside it the percentile interval of the same bootstrap, which is not used;
 - image: one frame of a Gaussian field with correlation length 2 pixels and a round lesion, its pixels taken as
   independent and in tiles.
 

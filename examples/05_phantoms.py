@@ -49,7 +49,7 @@ def slow_axis(found):
 
 # Half-wave plate: the axis follows the mount, the retardance stays.
 angles = np.radians([10, 30, 50, 70])
-plate = phantoms.half_wave_plate(SHAPE, angles, rng=1, retardance=2.9, variation=0.05, wedge=0.02)
+plate = phantoms.half_wave_plate(SHAPE, angles, rng=1, retardance=2.9, variation=0.05, smoothness=2.0, wedge=0.02)
 retardance, direction = slow_axis(measured(plate, 2))
 print("half-wave plate at another wavelength (2.9 rad)")
 for set_to, eta, seen in zip(angles, retardance, axis(direction), strict=True):
@@ -58,7 +58,7 @@ for set_to, eta, seen in zip(angles, retardance, axis(direction), strict=True):
 
 # Gel: retardance over thickness, since at constant volume it gets thinner as it is stretched.
 stretches = np.linspace(1.0, 1.5, 6)
-gel = phantoms.stretched_gel(SHAPE, stretches, rng=3, variation=0.03, axis_variation=0.05)
+gel = phantoms.stretched_gel(SHAPE, stretches, rng=3, variation=0.03, axis_variation=0.05, smoothness=2.0)
 retardance, _ = slow_axis(measured(gel, 4))
 birefringence = retardance.mean(axis=(-2, -1)) * 850e-9 / (2 * np.pi * phantoms.gel_thickness(stretches))
 print("stretched gel\n  stretch  birefringence  law of rubber")
@@ -66,22 +66,21 @@ for stretch, found in zip(stretches, birefringence, strict=True):
     print(f"  {stretch:7.2f}  {found:13.3e}  {float(phantoms.gel_birefringence(stretch)):13.3e}")
 
 # Chiral solution: a circular retarder, xi = -+pi/2 at theta_eta = pi/4.
-found = measured(phantoms.chiral(SHAPE, 0.15, rng=5, variation=0.1), 6)
+found = measured(phantoms.chiral(SHAPE, 0.15, rng=5, variation=0.1, smoothness=2.0), 6)
 rotation = -0.5 * found.retardance * np.sin(2 * found.retardance_angle) * np.sin(found.circularity)
 print(f"chiral solution: rotation {rotation.mean():.3f} +- {rotation.std():.3f} rad, made with 0.15 +- 0.015")
 
 # Film: D and its axis.
-found = measured(phantoms.film(SHAPE, 0.4, rng=7, diattenuation=0.6, transmission=0.4, variation=0.05), 8)
+found = measured(phantoms.film(SHAPE, 0.4, rng=7, diattenuation=0.6, transmission=0.4), 8)
 print(f"film: D {np.abs(found.diattenuation).mean():.3f}, made with 0.6")
 
 # Scattering gel in time: how fast its speckle forgets.
 moving = phantoms.scattering_gel((64, 64), rng=9, frames=6, memory=0.8)
 speckle = moving.gain - moving.gain.mean(axis=(-2, -1), keepdims=True)
-kept = np.abs((np.conj(speckle[0]) * speckle).mean(axis=(-2, -1))) / np.mean(np.abs(speckle) ** 2)
+kept = np.abs((np.conj(speckle[0]) * speckle).mean(axis=(-2, -1))) / np.mean(np.abs(speckle[0]) ** 2)
 print("scattering gel: correlation of the speckle with that of frame 0:", " ".join(f"{c:.2f}" for c in kept))
 
-for name, scene in {"plate": plate, "gel": gel, "speckle": moving[0]}.items():
-    scene.plot(pixel_size=9e-6).savefig(folder / f"{name}.png", dpi=80)
+moving[0].plot(pixel_size=9e-6).savefig(folder / "speckle.png", dpi=80)
 path = polinfer.save(plate, folder / "plate.nc", overwrite=True)
 assert len(polinfer.load(path)) == len(angles)
 print(f"saved to {folder}")

@@ -49,8 +49,9 @@ class Overlap:
             index = units * bins + np.searchsorted(edges, values, side="left")
             counts.append(np.bincount(index, minlength=regions.count * bins).reshape(regions.count, bins))
         self.counts = np.stack(counts, axis=1).astype(float)  # (unit, region, bin)
-        self.smooth = gaussian_filter1d(
-            np.eye(bins), WIDTH * bins / BINS, axis=0, mode="reflect" if period is None else "wrap"
+        # either way of closing the ends keeps the sums
+        self.smoothed = gaussian_filter1d(
+            self.counts, WIDTH * bins / BINS, axis=-1, mode="reflect" if period is None else "wrap"
         )
 
     @staticmethod
@@ -63,11 +64,10 @@ class Overlap:
     def both(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Resubstituted and crossed g (B,); and half the area between the smoothed densities, of all (B,) and without a
         copy of each unit (B, K)."""
-        total = np.tensordot(weights, self.counts, axes=1)
-        excess = self._excess(total)
-        smoothed = excess @ self.smooth.T
-        again = 0.5 * (np.sign(smoothed) * excess).sum(axis=-1)
-        others = self._excess(total[:, None] - self.counts) @ self.smooth.T  # (B, unit, bin)
+        total, blurred = (np.tensordot(weights, x, axes=1) for x in (self.counts, self.smoothed))
+        smoothed = self._excess(blurred)
+        again = 0.5 * (np.sign(smoothed) * self._excess(total)).sum(axis=-1)
+        others = self._excess(blurred[:, None] - self.smoothed)  # (B, unit, bin)
         pixels, decision = total.sum(axis=-1), np.sign(others)
         first, second = (
             np.einsum("km,bkm->bk", self.counts[:, r], decision) / pixels[:, r, None] for r in (0, 1)
@@ -112,15 +112,14 @@ class Overlap:
 
     def by_chance(self, weights: np.ndarray, level: float) -> float:
         """What half the area stays below with probability ``level`` where the densities are the same."""
-        own = self._excess(self.counts.sum(axis=0))
-        others = self._excess(np.tensordot(weights, self.counts, axes=1))
-        area = 0.5 * np.abs((others - own) @ self.smooth.T).sum(axis=-1)
+        own = self._excess(self.smoothed.sum(axis=0))
+        area = 0.5 * np.abs(self._excess(np.tensordot(weights, self.smoothed, axes=1)) - own).sum(axis=-1)
         units = int(self.regions.held.sum(axis=0).min())
         return float(np.quantile(area, level)) * np.sqrt(units / (units - 1))  # resamples vary less than samples
 
     def errors(self) -> np.ndarray:
         """Share of each region's pixels that the other units decide wrongly."""
-        decision = np.sign(self._excess(self.counts.sum(axis=0) - self.counts) @ self.smooth.T)
+        decision = np.sign(self._excess(self.smoothed.sum(axis=0) - self.smoothed))
         signs = np.array([1, -1])[:, None]
         wrong = 0.5 * self.counts * (1 - signs * decision[:, None])
         return np.asarray(wrong.sum(axis=(0, 2)) / self.regions.pixels)

@@ -12,8 +12,8 @@ from ..checks import boolean_array, broadcast, integer, real_array
 __all__ = ["Regions", "gather", "tiles"]
 
 # Pixels that are taken as independent are dealt at random into so many groups a region: groups of independent pixels
-# are as independent, and a hundred units are enough to learn how much they differ.
-GROUPS = 50
+# are as independent, and sixty units are enough to learn how much they differ.
+GROUPS = 30
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from .tissue import NAMES, lesion
 
 __all__ = ["cohort"]
 
-HEALTHY = Parameters(0.12, 0.3, 0.9, 0.5, 0.1)
+HEALTHY = Parameters(0.12, 0.6, 0.9, 0.6, 0.1)
 CHANGE = Parameters(0.03, 0.35, 0.4, 0.25, 0.0)  # of the lesion, where effect is 1
 BETWEEN = Parameters(0.02, 0.15, 0.15, 0.15, 0.05)  # standard deviations over samples, where between is 1
 
@@ -31,7 +31,7 @@ def cohort(
 ) -> Phantom:
     """Samples of tissue: the first ``diseased`` of them have a lesion, the last ``control`` have none.
 
-    Each is a :func:`lesion` scene. Healthy tissue has (D, theta_D, eta, theta_eta, xi) = (0.12, 0.3, 0.9, 0.5, 0.1);
+    Each is a :func:`lesion` scene. Healthy tissue has (D, theta_D, eta, theta_eta, xi) = (0.12, 0.6, 0.9, 0.6, 0.1);
     lesions differ by ``effect * (0.03, 0.35, 0.4, 0.25, 0)``. Samples differ by normal deviates of standard deviation
     ``between * (0.02, 0.15, 0.15, 0.15, 0.05)`` that healthy tissue and lesion of a sample share, and by deviates of
     half that of the lesion alone. Every second sample (0, 2, ...) has a fold 6 pixels wide, every third an edge.

