@@ -9,7 +9,18 @@ import inspect
 import jax
 
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
-ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "posterior", "calibration")
+ALL = (
+    *QUICK,
+    "peers",
+    "chain",
+    "parts",
+    "hard_cases",
+    "ordering",
+    "posterior",
+    "calibration",
+    "contrast",
+    "cohort_contrast",
+)
 
 
 def main() -> None:

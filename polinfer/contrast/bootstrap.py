@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtrit
 
 __all__ = ["Estimates", "draw", "jackknife", "symmetric_interval"]
 
@@ -22,12 +23,12 @@ BLOCK = 200  # resamples at a time
 
 @dataclass(frozen=True)
 class Estimates:
-    """For each of B weightings of the units: ``plain``, what the weighted units themselves have (B,); ``centre``, the
-    estimate of what their population has (B,); ``error``, its standard error (B,). All on a scale of their own."""
+    """For each of B weightings of the units: ``centre``, the estimate of what their population has (B,); ``error``, its
+    standard error (B,); ``target``, what the centres of resamples scatter about (B,). All on a scale of their own."""
 
-    plain: np.ndarray
     centre: np.ndarray
     error: np.ndarray
+    target: np.ndarray
 
 
 def jackknife(whole: np.ndarray, without: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,10 +63,11 @@ def draw(held: np.ndarray, resamples: int, generator: np.random.Generator) -> np
 
 
 def symmetric_interval(
-    estimate: Callable[[np.ndarray], Estimates], weights: np.ndarray, level: float
+    estimate: Callable[[np.ndarray], Estimates], weights: np.ndarray, level: float, freedom: int
 ) -> tuple[float, float]:
-    """Ends ``centre -+ q error``, q the ``level`` quantile of ``|centre* - plain| / error*`` over resamples.
+    """Ends ``centre -+ q error``, q the ``level`` quantile of ``|centre* - target| / error*`` over resamples.
 
+    q is that of Student's distribution at least: an error known from ``freedom + 1`` units is no better known than that.
     ``estimate`` takes weights (B, K), ``weights`` are those of the resamples. NaN where there is no standard error.
     """
     units = weights.shape[1]
@@ -74,10 +76,10 @@ def symmetric_interval(
         return float("nan"), float("nan")
     parts = [estimate(weights[i : i + BLOCK]) for i in range(0, len(weights), BLOCK)]
     centre, error = (np.concatenate([getattr(p, name) for p in parts]) for name in ("centre", "error"))
-    apart = np.abs(centre - own.plain)
+    apart = np.abs(centre - own.target)
     with np.errstate(divide="ignore", invalid="ignore"):
         deviation = np.where(apart > 0, apart / error, 0.0)
     if np.isnan(deviation).any():
         return float("nan"), float("nan")
-    reach = float(np.quantile(deviation, level)) * float(own.error[0])
+    reach = max(float(np.quantile(deviation, level)), float(stdtrit(freedom, 0.5 * (1 + level)))) * float(own.error[0])
     return float(own.centre[0]) - reach, float(own.centre[0]) + reach

@@ -23,6 +23,7 @@ class Ratio:
 
     def __init__(self, regions: Regions, period: float | None) -> None:
         self.period, self.middle = period, 0.0
+        self.freedom = int(regions.held.sum(axis=0).min()) - 1
         features = []
         for values, units in zip(regions.values, regions.units, strict=True):
             if period is None:
@@ -66,7 +67,8 @@ class Ratio:
         whole = self.scale(self.ratio(total))
         without = self.scale(self.ratio(total[:, None] - self.sums))
         centre, error = jackknife(whole, without, weights)
-        return Estimates(whole, centre, error)
+        # a target that is not freed of its bias would be as good in theory; this one holds more truths at large ratios
+        return Estimates(centre, error, centre)
 
     @staticmethod
     def scale(ratio: np.ndarray) -> np.ndarray:
@@ -75,7 +77,9 @@ class Ratio:
 
     def ends(self, weights: np.ndarray, level: float) -> tuple[float, float]:
         """Interval of the modulus, from resampled weights (B, K)."""
-        low, high = (float(sqrt(2) * np.sinh(x / sqrt(2))) for x in symmetric_interval(self, weights, level))
+        low, high = (
+            float(sqrt(2) * np.sinh(x / sqrt(2))) for x in symmetric_interval(self, weights, level, self.freedom)
+        )
         if low <= 0 <= high:
             low, high = 0.0, max(-low, high)
         elif high < 0:

@@ -86,8 +86,8 @@ class Overlap:
         again, crossed, area, without = self.both(weights)
         # the area varies smoothly where a unit is left out, the decisions do not
         _, error = jackknife(self.scale(area), self.scale(without), weights)
-        plain = self.scale(again)
-        return Estimates(plain, 0.5 * (plain + self.scale(crossed)), error)
+        own = self.scale(again)
+        return Estimates(0.5 * (own + self.scale(crossed)), error, own)
 
     @staticmethod
     def scale(overlap: np.ndarray) -> np.ndarray:
@@ -97,7 +97,8 @@ class Overlap:
     def ends(self, weights: np.ndarray, level: float) -> tuple[float, float]:
         """Interval from resampled weights (B, K)."""
         _, _, area, _ = self.both(np.ones((1, self.regions.count)))
-        low, high = (float(2 * ndtr(0.5 * x) - 1) for x in symmetric_interval(self, weights, level))
+        freedom = int(self.regions.held.sum(axis=0).min()) - 1
+        low, high = (float(2 * ndtr(0.5 * x) - 1) for x in symmetric_interval(self, weights, level, freedom))
         if area[0] <= self.by_chance(weights, level):
             low = 0.0
         numbers, errors = self.effective_pixels(), self.errors()
