@@ -67,7 +67,7 @@ def symmetric_interval(
 ) -> tuple[float, float]:
     """Ends ``centre -+ q error``, q the ``level`` quantile of ``|centre* - target| / error*`` over resamples.
 
-    q is that of Student's distribution at least: an error known from ``freedom + 1`` units is no better known than that.
+    q is that of Student's distribution at least: an error from ``freedom + 1`` units is no better known than that.
     ``estimate`` takes weights (B, K), ``weights`` are those of the resamples. NaN where there is no standard error.
     """
     units = weights.shape[1]

@@ -25,7 +25,7 @@ class Contrast:
     >>> from polinfer import contrast
     >>> labels = np.repeat([0, 1], 500)
     >>> print(contrast.cnr(np.random.default_rng(0).normal(3.0 * labels), labels, rng=1))
-    2.14 (95 %: 2.02 to 2.26)
+    2.14 (95 %: 2.01 to 2.27)
     """
 
     value: float
