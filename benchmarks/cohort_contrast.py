@@ -1,13 +1,13 @@
-"""Which map shows a lesion best? The paper's figure of contrasts, and its sweep of the window, on simulated samples.
+"""Which map shows a lesion best? The paper's figure of contrasts, and its sweep, on simulated samples.
 
-Nine samples (six with a lesion) of :func:`polinfer.phantoms.cohort` are measured with noise and fitted; amplitude, phase and the
-five parameters are filtered in a window of 15 x 15 pixels: expectation E(), entropy H(), entropy of what the noise leaves
-(H less noise, from the posterior widths), and co-occurrence entropy with the offset (0, 4), H(x, x'), less its independent part:
-half of it, so that the numbers have one scale. Contrast is that of lesion and healthy tissue, folds included in neither, with
-95 % intervals over samples. What lies beyond the edge of a sample is masked.
+Nine samples (six with a lesion) of :func:`polinfer.phantoms.cohort` are measured with noise and fitted. Amplitude,
+phase and the five parameters are filtered in a window of 15 x 15 pixels: expectation E, entropy H, the same less the
+noise (from the widths of the posteriors), and co-occurrence entropy H(x, x') with the offset (0, 4), half of it, so
+that all have one scale. Contrast is that of lesion and healthy tissue; folds are neither, and what lies beyond the
+edge of a sample is masked. 95 % intervals over samples.
 
-The tissue is made so that lesions have other axes and more disorder, above all of phase. So the figure says how well each
-metric sees what is there, through noise, with nine samples; it says nothing of mice.
+The tissue is made so that lesions have other axes and more disorder, above all of phase. So the figure says how well
+each metric sees what is there, through noise, with nine samples; it says nothing of mice.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ LENGTHS = (1, 2, 4, 8)
 DIRECTIONS = {"along": (0, 4), "down": (4, 0), "diagonal": (3, 3), "other diagonal": (3, -3)}
 DISTRIBUTIONS = {
     "amplitude": filters.Chi(1), "phase": VonMises, "diattenuation": TruncatedNormal,
-    "diattenuation_angle": AxialVonMises, "retardance": VonMises, "retardance_angle": AxialVonMises, "circularity": VonMises,
+    "diattenuation_angle": AxialVonMises, "retardance": VonMises, "retardance_angle": AxialVonMises,
+    "circularity": VonMises,
 }  # fmt: skip
 PERIODS = {VonMises: 2 * np.pi, AxialVonMises: np.pi}
 METRICS = ("E", "H", "H less noise", "H(x, x')")
