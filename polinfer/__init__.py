@@ -1,6 +1,6 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import conventions, datasets, phantoms
+from . import conventions, datasets, phantoms, texture
 from .bounds import cramer_rao_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
@@ -62,4 +62,5 @@ __all__ = [
     "simulate",
     "smooth_gauge",
     "summarise",
+    "texture",
 ]

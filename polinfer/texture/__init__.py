@@ -4,15 +4,20 @@ from .angles import Angle, Rescaled, von_mises_entropy
 from .base import Distribution
 from .bounded import Bounded
 from .chi import Chi
-from .filters import Texture, describe, entropy, expectation
+from .filters import Texture, cooccurrence_entropy, describe, entropy, expectation
+from .joint import Joint, MultivariateVonMises, TorusGraph
 
 __all__ = [
     "Angle",
     "Bounded",
     "Chi",
     "Distribution",
+    "Joint",
+    "MultivariateVonMises",
     "Rescaled",
     "Texture",
+    "TorusGraph",
+    "cooccurrence_entropy",
     "describe",
     "entropy",
     "expectation",

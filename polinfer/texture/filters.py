@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import pi
+from math import log, pi
 from typing import Any
 
 import numpy as np
 
-from ..checks import boolean_array, integer, real_array
+from ..checks import boolean_array, integer, one_of_types, real_array
 from ..neighbours import plane
 from ..priors import AxialVonMises, Prior, TruncatedNormal, VonMises
 from ..storage import array
-from .angles import Angle
+from .angles import Angle, Rescaled
 from .base import Distribution, Wanted
 from .bounded import Bounded
+from .joint import Joint, MultivariateVonMises
+from .moments import joint_windows
 from .windows import Sweep, sweep
 
 __all__ = ["FAMILIES", "Texture", "describe", "distribution_of", "entropy", "expectation"]
@@ -240,5 +242,150 @@ def entropy(
     mask: Any | None = None,
     std: Any | None = None,
     fewest: int = 5,
+    stride: int = 1,
+    joint: Joint = MultivariateVonMises(),  # noqa: B008
 ) -> np.ndarray:
-    return _filtered(("entropy",), images, size, distribution, mask, std, fewest)["entropy"]
+    r"""Differential entropy of the distribution that fits the pixels around each pixel, in nats.
+
+    One image: as :func:`describe`. Several: the entropy of their joint distribution, fitted by score matching in closed
+    form. Independent images have the sum of their entropies, and what they know of each other is missing from it. All
+    of them must be angles, or amplitudes and the like in the disguise of :class:`Rescaled`.
+
+    Parameters
+    ----------
+    images: an array, or a list of arrays of one shape.
+    size, mask, fewest: as for :func:`describe`. The windows of d images need more pixels than fitted parameters.
+    distribution, std: one for all images, or a list with one for each.
+    stride: only every so many rows and columns, for joint distributions take their time: about 5 microseconds a window
+        for two images, 200 for three.
+    joint: what is fitted to several images, :class:`MultivariateVonMises` or :class:`TorusGraph`.
+
+    Returns
+    -------
+    shape of an image, every ``stride``-th row and column. NaN where the window has too few pixels or the data do not
+    determine the fit; minus infinity where the pixels lie on a line, two images being equal, for instance.
+
+    Raises
+    ------
+    ValueError, TypeError: shapes, sizes, values outside the distribution's range, a joint distribution of others than
+    angles.
+
+    >>> rng = np.random.default_rng(1)
+    >>> one = rng.vonmises(0, 5, (31, 31))
+    >>> other = one + rng.vonmises(0, 5, (31, 31))
+    >>> apart = entropy(one, 31)[15, 15] + entropy(other, 31)[15, 15]
+    >>> bool(apart - entropy([one, other], 31)[15, 15] > 0.25)            # half a bit of common information
+    True
+    """
+    stride = integer("stride", stride, low=1)
+    if not isinstance(images, list | tuple):
+        kept = _filtered(("entropy",), images, size, distribution, mask, std, fewest)["entropy"]
+        return kept[(..., *(slice(None, None, stride),) * min(kept.ndim, 2))]
+    one_of_types("joint", joint, (Joint,), "pass MultivariateVonMises() or TorusGraph().")
+    values = [real_array(f"images[{i}]", x) for i, x in enumerate(images)]
+    if not values:
+        raise ValueError("images is an empty list; pass at least one image.")
+    if len({x.shape for x in values}) > 1:
+        raise ValueError(f"images must have one shape, got {', '.join(str(x.shape) for x in values)}.")
+    families = [distribution_of("distribution", x) for x in _each("distribution", distribution, len(values))]
+    widths = [None if x is None else real_array("std", x, low=0) for x in _each("std", std, len(values))]
+    if len(values) == 1:
+        return entropy(values[0], size, families[0], mask, widths[0], fewest, stride)
+    size, fewest = checked_size(size), integer("fewest", fewest, low=3)
+    shape = values[0].shape
+    used = np.ones(shape, bool) if mask is None else broadcast_to("mask", boolean_array("mask", mask), shape).copy()
+    for x in values:
+        used &= np.isfinite(x)
+    angles, noise, jacobian = [], [], 0.0
+    for i, (x, family, width) in enumerate(zip(values, families, widths, strict=True)):
+        family.check(f"images[{i}]", np.where(used, x, np.nan))
+        centre = family.centre if isinstance(family, Rescaled) else 0.0
+        angle = family.angle if isinstance(family, Rescaled) else family
+        if not isinstance(angle, Angle):
+            raise TypeError(f"distribution of images[{i}] is {family!r}: joint distributions are of angles; pass "
+                            "Rescaled(centre, scale) for what is none.")  # fmt: skip
+        s = np.zeros(shape) if width is None else broadcast_to("std", width, shape)
+        used &= np.isfinite(s)
+        angles.append(angle.frequency * (x.astype(float) - centre))
+        noise.append(angle.frequency * s)
+        jacobian -= log(angle.frequency)
+    planes = (-1, *plane(shape))
+    found = joint_windows(
+        [x.reshape(planes) for x in angles],
+        None if all(w is None for w in widths) else [x.reshape(planes) for x in noise],
+        used.reshape(planes), size, joint, max(fewest, joint.degrees(len(values)) + 1), stride,
+    )  # fmt: skip
+    single = all(x.dtype == np.float32 for x in values)
+    return (found + jacobian).reshape(_strided(shape, stride)).astype(np.float32 if single else float)
+
+
+def _each(name: str, given: Any, number: int) -> list[Any]:
+    """One for each image: those of a list, or the same for all."""
+    if not isinstance(given, list | tuple):
+        return [given] * number
+    if len(given) != number:
+        raise ValueError(f"{name} is a list of {len(given)} for {number} images; pass one for each, or one for all.")
+    return list(given)
+
+
+def _strided(shape: tuple[int, ...], stride: int) -> tuple[int, ...]:
+    return (*shape[:-2], *(-(-n // stride) for n in shape[-2:]))
+
+
+def cooccurrence_entropy(
+    images: Any,
+    size: int = 15,
+    distribution: Any = VonMises,
+    mask: Any | None = None,
+    std: Any | None = None,
+    fewest: int = 5,
+    stride: int = 1,
+    joint: Joint = MultivariateVonMises(),  # noqa: B008
+    offset: tuple[int, int] = (0, 4),
+) -> np.ndarray:
+    """Entropy of the joint distribution of pixels and of those that are ``offset`` (rows, columns) away, in nats.
+
+    The window holds the first pixel of each pair; pairs of which one is masked, not finite or outside the frame are
+    left out. Arguments as for :func:`entropy`; P images give a distribution of 2 P values. It is twice the entropy of
+    one image where such pixels are independent, and less where they know of each other.
+
+    Raises
+    ------
+    ValueError, TypeError: as for :func:`entropy`; an offset of (0, 0).
+
+    >>> angles = np.random.default_rng(1).vonmises(0.5, 4.0, (24, 24))
+    >>> twice = 2 * entropy(angles, 21)[12, 10]
+    >>> bool(abs(cooccurrence_entropy(angles, 21, offset=(0, 4))[12, 10] - twice) < 0.15)
+    True
+    """
+    rows, columns = (integer("offset", n) for n in offset)
+    if (rows, columns) == (0, 0):
+        raise ValueError("offset must not be (0, 0): a pixel is no pair with itself.")
+    first = list(images) if isinstance(images, list | tuple) else [images]
+    first = [real_array(f"images[{i}]", x) for i, x in enumerate(first)]
+    families, widths = _each("distribution", distribution, len(first)), _each("std", std, len(first))
+    if mask is not None:
+        inside = boolean_array("mask", mask)
+        first = [np.where(broadcast_to("mask", inside, x.shape), x, np.nan) for x in first]
+    second = [_moved(x, rows, columns) for x in first]
+    spread = None
+    if any(x is not None for x in widths):
+        own = [
+            np.broadcast_to(np.asarray(0.0 if w is None else w, float), x.shape)
+            for w, x in zip(widths, first, strict=True)
+        ]
+        # where there is no partner the image says so
+        spread = own + [np.nan_to_num(_moved(x, rows, columns)) for x in own]
+    return entropy(first + second, size, families * 2, None, spread, fewest, stride, joint)
+
+
+def _moved(values: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """The image whose pixel (y, x) is that of (y + rows, x + columns); NaN outside."""
+    high, wide = plane(values.shape)
+    frame = values.reshape(-1, high, wide)
+    moved = np.full(frame.shape, np.nan, values.dtype)
+    if abs(rows) < high and abs(columns) < wide:
+        there = (slice(None), slice(max(rows, 0), high + min(rows, 0)), slice(max(columns, 0), wide + min(columns, 0)))
+        here = (slice(None), slice(max(-rows, 0), high - max(rows, 0)), slice(max(-columns, 0), wide - max(columns, 0)))
+        moved[here] = frame[there]
+    return moved.reshape(values.shape)
