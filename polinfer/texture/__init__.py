@@ -4,14 +4,17 @@ from .angles import Angle, Rescaled, von_mises_entropy
 from .base import Distribution
 from .bounded import Bounded
 from .chi import Chi
-from .filters import Texture, cooccurrence_entropy, describe, entropy, expectation
+from .filters import cooccurrence_entropy, describe, entropy, expectation
+from .fits import of_fit
 from .joint import Joint, MultivariateVonMises, TorusGraph
+from .records import FitTexture, Texture
 
 __all__ = [
     "Angle",
     "Bounded",
     "Chi",
     "Distribution",
+    "FitTexture",
     "Joint",
     "MultivariateVonMises",
     "Rescaled",
@@ -21,5 +24,6 @@ __all__ = [
     "describe",
     "entropy",
     "expectation",
+    "of_fit",
     "von_mises_entropy",
 ]

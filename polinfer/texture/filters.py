@@ -1,163 +1,21 @@
-"""Sliding-window filters of one image."""
+"""The verbs: expectation and entropy of images, one or several, in a sliding window."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import log, pi
 from typing import Any
 
 import numpy as np
 
 from ..checks import boolean_array, integer, one_of_types, real_array
 from ..neighbours import plane
-from ..priors import AxialVonMises, Prior, TruncatedNormal, VonMises
-from ..storage import array
-from .angles import Angle, Rescaled
-from .base import Distribution, Wanted
-from .bounded import Bounded
+from ..priors import VonMises
+from .families import distribution_of
+from .frames import broadcast_to, filtered
 from .joint import Joint, MultivariateVonMises
-from .moments import joint_windows
-from .windows import Sweep, sweep
+from .joint_frames import each_of, joint_filtered
+from .records import Texture
 
-__all__ = ["FAMILIES", "Texture", "describe", "distribution_of", "entropy", "expectation"]
-
-#: The distribution that each class of densities stands for.
-FAMILIES: dict[type[Prior], Distribution] = {
-    VonMises: Angle(2 * pi),
-    AxialVonMises: Angle(pi),
-    TruncatedNormal: Bounded(-1.0, 1.0),
-}
-
-
-@dataclass(frozen=True, eq=False)
-class Texture:
-    """What :func:`describe` found in the window around each pixel, shape P. NaN where the window has too few pixels.
-
-    Attributes
-    ----------
-    expectation: mean of the fitted distribution, in the unit of the image.
-    entropy: its differential entropy, nats; that of the tissue alone where the noise was given.
-    noise_entropy: entropy of the noise in the window, nats; None where no noise was given.
-    count: pixels in the window; where noise was given for angles, the number without noise that they are worth.
-    size: side of the window, pixels. distribution: what was fitted.
-    """
-
-    expectation: np.ndarray = array(("*P",), "unit of the image")
-    entropy: np.ndarray = array(("*P",), "nat")
-    noise_entropy: np.ndarray | None = array(("*P",), "nat")
-    count: np.ndarray = array(("*P",), "1")
-    size: int = 15
-    distribution: Distribution = FAMILIES[VonMises]
-
-
-def distribution_of(name: str, distribution: Any) -> Distribution:
-    """The distribution that an argument names: a :class:`Distribution`, or a class of densities in ``FAMILIES``."""
-    if isinstance(distribution, Distribution):
-        return distribution
-    if isinstance(distribution, type) and distribution in FAMILIES:
-        return FAMILIES[distribution]
-    known = ", ".join(x.__name__ for x in FAMILIES)
-    raise TypeError(
-        f"{name} must be one of the classes {known}, or an object such as Chi(1), Bounded(low, high), Angle(period) or "
-        f"Rescaled(centre, scale), got {distribution!r}."
-    )
-
-
-class _Frame(Sweep):
-    """One frame: its pixels, and the maps that are filled."""
-
-    def __init__(
-        self,
-        values: np.ndarray,
-        noise: np.ndarray | None,
-        used: np.ndarray | None,
-        distribution: Distribution,
-        fewest: int,
-        maps: dict[str, np.ndarray],
-    ) -> None:
-        self.values, self.noise, self.used = values, noise, used
-        self.distribution, self.fewest, self.maps = distribution, fewest, maps
-        self.features = distribution.features(noise is not None)
-        self.single = values.dtype == np.float32 and distribution.single and noise is None
-        self.again: list[slice] = []
-
-    def run(self, size: int) -> None:
-        """Fill the maps."""
-        shape = self.values.shape
-        if self.single:
-            sweep(self, shape, size, np.dtype(np.float32))
-            self.single = False
-            if self.again:
-                sweep(self, shape, size, np.dtype(np.float64), self.again)
-        else:
-            sweep(self, shape, size, np.dtype(np.float64))
-
-    def load(self, rows: slice, out: np.ndarray) -> None:
-        values = self.values[rows]
-        noise = None if self.noise is None else self.noise[rows]
-        used = np.isfinite(values)
-        if self.used is not None:
-            used &= self.used[rows]
-        if noise is not None:
-            used &= np.isfinite(noise)
-            noise = np.where(used, noise, 0).astype(out.dtype, copy=False)
-        values = np.where(used, values, 0).astype(out.dtype, copy=False)
-        self.distribution.load(values, noise, used, out)
-
-    def finish(self, rows: slice, sums: np.ndarray, spare: np.ndarray) -> None:
-        high, wide = rows.stop - rows.start, self.values.shape[1]
-        wanted = Wanted("expectation" in self.maps, "entropy" in self.maps)
-        found = self.distribution.finish(sums, spare, self.noise is not None, wanted)
-        few = found.count.reshape(high, -1)[:, :wide] < self.fewest
-        for name, target in self.maps.items():
-            target[rows] = getattr(found, name).reshape(high, -1)[:, :wide]
-            if name != "count":
-                target[rows][few] = np.nan
-        if self.single and wanted.entropy and np.any(self.maps["entropy"][rows] < self.distribution.single_floor):
-            self.again.append(rows)
-
-
-def _filtered(
-    names: tuple[str, ...], image: Any, size: int, distribution: Any, mask: Any, std: Any, fewest: int
-) -> dict[str, np.ndarray]:
-    """The maps of these names, after a check of the arguments."""
-    values = real_array("image", image)
-    family = distribution_of("distribution", distribution)
-    size = checked_size(size)
-    fewest = integer("fewest", fewest, low=3)
-    used = None if mask is None else broadcast_to("mask", boolean_array("mask", mask), values.shape)
-    noise = None if std is None else broadcast_to("std", real_array("std", std, low=0), values.shape)
-    family.check("image", values if used is None else np.where(used, values, np.nan))
-    kept = values.dtype if values.dtype in (np.float32, np.float64) else np.dtype(np.float64)
-    if noise is not None:
-        names = (*names, "noise_entropy") if "count" in names else names
-    maps = {name: np.empty(values.shape, kept) for name in names}
-    for frame in range(int(np.prod(values.shape[:-2]))):
-        one = [None if x is None else _frame(x, frame) for x in (values, noise, used)]
-        _Frame(*one, family, fewest, {name: _frame(x, frame) for name, x in maps.items()}).run(size)  # type: ignore[arg-type]
-    return maps
-
-
-def _frame(values: np.ndarray, number: int) -> np.ndarray:
-    """One of the frames that stand in the leading axes, a view."""
-    rows, columns = plane(values.shape)
-    return values.reshape(-1, rows, columns)[number]
-
-
-def checked_size(size: int) -> int:
-    """Side of a window: odd, from 3."""
-    size = integer("size", size, low=3)
-    if size % 2 == 0:
-        raise ValueError(f"size must be odd, so that the window has a centre, got {size}.")
-    return size
-
-
-def broadcast_to(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """``values`` with the shape of the image, or an error."""
-    try:
-        return np.broadcast_to(values, shape)
-    except ValueError:
-        raise ValueError(f"{name} has shape {values.shape}, which does not fit the image, {shape}.") from None
+__all__ = ["cooccurrence_entropy", "describe", "entropy", "expectation"]
 
 
 def describe(
@@ -212,7 +70,7 @@ def describe(
     True
     """
     family = distribution_of("distribution", distribution)
-    maps = _filtered(("expectation", "entropy", "count"), image, size, family, mask, std, fewest)
+    maps = filtered(("expectation", "entropy", "count"), image, size, family, mask, std, fewest)
     return Texture(maps["expectation"], maps["entropy"], maps.get("noise_entropy"), maps["count"], int(size), family)
 
 
@@ -232,7 +90,7 @@ def expectation(
     >>> expectation(np.full((3, 3), np.pi), size=3, fewest=4)[1].tolist() == [np.pi] * 3       # no jump at the wrap
     True
     """
-    return _filtered(("expectation",), image, size, distribution, mask, std, fewest)["expectation"]
+    return filtered(("expectation",), image, size, distribution, mask, std, fewest)["expectation"]
 
 
 def entropy(
@@ -279,57 +137,15 @@ def entropy(
     """
     stride = integer("stride", stride, low=1)
     if not isinstance(images, list | tuple):
-        kept = _filtered(("entropy",), images, size, distribution, mask, std, fewest)["entropy"]
-        return kept[(..., *(slice(None, None, stride),) * min(kept.ndim, 2))]
+        kept = filtered(("entropy",), images, size, distribution, mask, std, fewest)["entropy"]
+        return kept[..., ::stride, ::stride] if kept.ndim > 1 else kept[..., ::stride]
     one_of_types("joint", joint, (Joint,), "pass MultivariateVonMises() or TorusGraph().")
     values = [real_array(f"images[{i}]", x) for i, x in enumerate(images)]
-    if not values:
-        raise ValueError("images is an empty list; pass at least one image.")
-    if len({x.shape for x in values}) > 1:
-        raise ValueError(f"images must have one shape, got {', '.join(str(x.shape) for x in values)}.")
-    families = [distribution_of("distribution", x) for x in _each("distribution", distribution, len(values))]
-    widths = [None if x is None else real_array("std", x, low=0) for x in _each("std", std, len(values))]
+    families = [distribution_of("distribution", x) for x in each_of("distribution", distribution, len(values))]
+    widths = each_of("std", std, len(values))
     if len(values) == 1:
         return entropy(values[0], size, families[0], mask, widths[0], fewest, stride)
-    size, fewest = checked_size(size), integer("fewest", fewest, low=3)
-    shape = values[0].shape
-    used = np.ones(shape, bool) if mask is None else broadcast_to("mask", boolean_array("mask", mask), shape).copy()
-    for x in values:
-        used &= np.isfinite(x)
-    angles, noise, jacobian = [], [], 0.0
-    for i, (x, family, width) in enumerate(zip(values, families, widths, strict=True)):
-        family.check(f"images[{i}]", np.where(used, x, np.nan))
-        centre = family.centre if isinstance(family, Rescaled) else 0.0
-        angle = family.angle if isinstance(family, Rescaled) else family
-        if not isinstance(angle, Angle):
-            raise TypeError(f"distribution of images[{i}] is {family!r}: joint distributions are of angles; pass "
-                            "Rescaled(centre, scale) for what is none.")  # fmt: skip
-        s = np.zeros(shape) if width is None else broadcast_to("std", width, shape)
-        used &= np.isfinite(s)
-        angles.append(angle.frequency * (x.astype(float) - centre))
-        noise.append(angle.frequency * s)
-        jacobian -= log(angle.frequency)
-    planes = (-1, *plane(shape))
-    found = joint_windows(
-        [x.reshape(planes) for x in angles],
-        None if all(w is None for w in widths) else [x.reshape(planes) for x in noise],
-        used.reshape(planes), size, joint, max(fewest, joint.degrees(len(values)) + 1), stride,
-    )  # fmt: skip
-    single = all(x.dtype == np.float32 for x in values)
-    return (found + jacobian).reshape(_strided(shape, stride)).astype(np.float32 if single else float)
-
-
-def _each(name: str, given: Any, number: int) -> list[Any]:
-    """One for each image: those of a list, or the same for all."""
-    if not isinstance(given, list | tuple):
-        return [given] * number
-    if len(given) != number:
-        raise ValueError(f"{name} is a list of {len(given)} for {number} images; pass one for each, or one for all.")
-    return list(given)
-
-
-def _strided(shape: tuple[int, ...], stride: int) -> tuple[int, ...]:
-    return (*shape[:-2], *(-(-n // stride) for n in shape[-2:]))
+    return joint_filtered(values, size, families, mask, widths, fewest, stride, joint)
 
 
 def cooccurrence_entropy(
@@ -363,7 +179,7 @@ def cooccurrence_entropy(
         raise ValueError("offset must not be (0, 0): a pixel is no pair with itself.")
     first = list(images) if isinstance(images, list | tuple) else [images]
     first = [real_array(f"images[{i}]", x) for i, x in enumerate(first)]
-    families, widths = _each("distribution", distribution, len(first)), _each("std", std, len(first))
+    families, widths = each_of("distribution", distribution, len(first)), each_of("std", std, len(first))
     if mask is not None:
         inside = boolean_array("mask", mask)
         first = [np.where(broadcast_to("mask", inside, x.shape), x, np.nan) for x in first]

@@ -20,7 +20,12 @@ class Joint(ABC):
 
     Statistics are real trigonometric polynomials, of degree 1 in every angle, written as Fourier series: frequency k
     to the coefficient of ``e^{i k.x}``. They refer to angles from which the mean directions were subtracted.
+
+    ``singular`` is what the parameters are where the pixels do not determine them: infinite if that happens only on a
+    line of the torus, where the density has no bound, NaN if it may happen elsewhere.
     """
+
+    singular: float = np.nan
 
     @abstractmethod
     def statistics(self, angles: int) -> list[Statistic]:
@@ -54,6 +59,8 @@ class MultivariateVonMises(Joint):
     Taylor and Singh, Canadian Journal of Statistics 36, 2008.
     """
 
+    singular = np.inf
+
     def statistics(self, angles: int) -> list[Statistic]:
         single = [_cosine(*_unit(angles, {j: 1})) for j in range(angles)]
         pairs = []
@@ -75,8 +82,9 @@ class TorusGraph(Joint):
     .. math:: p(x) \propto \exp\Big(\sum_j a_j^T s(x_j) + \sum_{j<k} b_{jk}^T s(x_j - x_k) + c_{jk}^T s(x_j + x_k)\Big),
               \quad s(x) = (\cos x, \sin x)
 
-    It describes what the sine model cannot: angles that are uniform each but differ by a constant, for instance. Where
-    angles are concentrated, some of its parameters are not determined: there it has no answer. Source: Klein et al.,
+    It describes what the sine model cannot: angles that are uniform each but differ by a constant, for instance. It has
+    many parameters, 8 for two angles and 18 for three. Where angles are concentrated they are hardly determined, and
+    the entropy is far too small in windows of few pixels, or NaN; take the sine model there. Source: Klein et al.,
     Annals of Applied Statistics 14, 2020.
     """
 
@@ -135,19 +143,21 @@ def terms(model: Joint, angles: int) -> Terms:
     return Terms(tuple(places), tuple(quadratic), tuple(linear), len(statistics))
 
 
-def score_matching(found: Terms, means: np.ndarray) -> np.ndarray:
+def score_matching(found: Terms, means: np.ndarray, noisy: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     r"""Parameters that minimise the mean of ``|grad log p|^2 / 2 + laplace log p`` over the pixels of each window.
 
-    That needs no normaliser and is linear: ``G p = h`` with ``G_ab`` the mean of ``grad s_a . grad s_b`` and ``h_a`` minus
-    that of ``laplace s_a`` (Hyvarinen 2005).
+    That needs no normaliser and is linear: ``G p = h`` with ``G_ab`` the mean of ``grad s_a . grad s_b`` and ``h_a``
+    minus that of ``laplace s_a`` (Hyvarinen 2005).
 
     Parameters
     ----------
-    means: complex (frequencies, pixels), means of ``e^{i k.x}``.
+    means: complex (frequencies, pixels), means of ``e^{i k.x}``. noisy: whether noise was taken out of them, so that G
+        may have negative eigenvalues.
 
     Returns
     -------
-    (pixels, parameters); infinite where the pixels lie on a line of the torus, so that the density has no bound.
+    parameters: (pixels, parameters). point: (pixels,), where an angle is constant, or noise explains all of it.
+    singular: (pixels,), where G has no inverse.
     """
     pixels = means.shape[1]
     matrix, right = np.zeros((pixels, found.size, found.size)), np.zeros((pixels, found.size))
@@ -167,8 +177,6 @@ def score_matching(found: Terms, means: np.ndarray) -> np.ndarray:
     matrix = np.where(lower, np.swapaxes(matrix, 1, 2), matrix)
     flat = ~np.isfinite(matrix).all(axis=(1, 2)) | (diagonal <= 1e-13).any(axis=1)
     matrix[flat] = np.eye(found.size)
-    singular = np.linalg.det(matrix) < 1e-13
+    singular = np.linalg.eigvalsh(matrix)[:, 0] < 1e-10 if noisy else np.linalg.det(matrix) < 1e-13
     matrix[singular] = np.eye(found.size)
-    solution = np.linalg.solve(matrix, (right / scale)[..., None])[..., 0] / scale
-    solution[flat | singular] = np.inf
-    return solution
+    return np.linalg.solve(matrix, (right / scale)[..., None])[..., 0] / scale, flat, singular

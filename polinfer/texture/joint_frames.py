@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from functools import reduce
+from math import log
+from typing import Any
 
 import numpy as np
 
+from ..checks import boolean_array, integer, one_of_types, real_array
+from ..neighbours import plane
+from .angles import Angle, Rescaled
+from .base import Distribution
+from .frames import broadcast_to, checked_size
 from .joint import Joint, score_matching, terms
 from .quadrature import joint_entropy
 from .windows import Sweep, sweep
 
-__all__ = ["joint_windows"]
+__all__ = ["each_of", "joint_filtered"]
 
 
 class _JointFrame(Sweep):
@@ -70,7 +77,9 @@ class _JointFrame(Sweep):
             for j, k in enumerate(frequency):
                 if k:
                     means[place] *= unit[j] ** k if k > 0 else np.conj(unit[j]) ** -k
-        parameters = score_matching(self.terms, means)
+        parameters, point, singular = score_matching(self.terms, means, noisy=self.noise is not None)
+        parameters[singular] = self.model.singular
+        parameters[point] = np.inf
         found = joint_entropy(self.model, parameters, np.abs(np.array(directions)).T)
         entropy[enough] = found + _correction(count, d, self.model.degrees(d))
         begin = (rows.start + first) // step
@@ -80,8 +89,8 @@ class _JointFrame(Sweep):
 def _correction(count: np.ndarray, angles: int, degrees: int) -> np.ndarray:
     """What entropies of few pixels lack on average: that of a Gaussian, exactly, and half of each further parameter.
 
-    The log determinant of a covariance of n draws in d dimensions loses ``log(n / 2) - digamma((n - i) / 2)`` for each i
-    from 1 to d.
+    The log determinant of a covariance of n draws in d dimensions loses ``log(n / 2) - digamma((n - i) / 2)`` for each
+    i from 1 to d.
     """
     from scipy.special import digamma
 
@@ -91,18 +100,50 @@ def _correction(count: np.ndarray, angles: int, degrees: int) -> np.ndarray:
     return 0.5 * np.asarray(gaussian) + 0.5 * further / count
 
 
-def joint_windows(
-    angles: list[np.ndarray], noise: list[np.ndarray] | None, used: np.ndarray, size: int, model: Joint, fewest: int,
-    stride: int,
+def joint_filtered(
+    values: list[np.ndarray], size: int, families: list[Distribution], mask: Any, widths: list[Any], fewest: int,
+    stride: int, model: Joint,
 ) -> np.ndarray:  # fmt: skip
-    """Entropies of the joint distributions of angles, period 2 pi, in the windows of frames ``(frames, y, x)``.
-
-    ``used``: which pixels count, all angles being finite there. Returns every ``stride``-th row and column.
-    """
-    frames, rows, columns = used.shape
-    result = np.full((frames, -(-rows // stride), -(-columns // stride)), np.nan)
-    for i in range(frames):
-        one = None if noise is None else [x[i] for x in noise]
-        frame = _JointFrame([x[i] for x in angles], one, used[i], model, fewest, stride, result[i])
+    """Joint entropy of several images, after a check of the arguments; every ``stride``-th row and column."""
+    one_of_types("joint", model, (Joint,), "pass MultivariateVonMises() or TorusGraph().")
+    if not values:
+        raise ValueError("images is an empty list; pass at least one image.")
+    if len({x.shape for x in values}) > 1:
+        raise ValueError(f"images must have one shape, got {', '.join(str(x.shape) for x in values)}.")
+    size, fewest = checked_size(size), integer("fewest", fewest, low=3)
+    shape = values[0].shape
+    used = np.ones(shape, bool) if mask is None else broadcast_to("mask", boolean_array("mask", mask), shape).copy()
+    for x in values:
+        used &= np.isfinite(x)
+    angles, noise, jacobian = [], [], 0.0
+    for i, (x, family, width) in enumerate(zip(values, families, widths, strict=True)):
+        angle = family.angle if isinstance(family, Rescaled) else family
+        if not isinstance(angle, Angle):
+            raise TypeError(f"distribution of images[{i}] is {family!r}: joint distributions are of angles; pass "
+                            "Rescaled(centre, scale) for what is none.")  # fmt: skip
+        family.check(f"images[{i}]", np.where(used, x, np.nan))
+        centre = family.centre if isinstance(family, Rescaled) else 0.0
+        angles.append(angle.frequency * (x.astype(float) - centre))
+        jacobian -= log(angle.frequency)
+        s = np.zeros(shape) if width is None else broadcast_to("std", real_array("std", width, low=0), shape)
+        used &= np.isfinite(s)
+        noise.append(angle.frequency * s)
+    rows, columns = plane(shape)
+    frames = [x.reshape(-1, rows, columns) for x in (used, *angles, *noise)]
+    d, noisy = len(values), any(w is not None for w in widths)
+    result = np.full((len(frames[0]), -(-rows // stride), -(-columns // stride)), np.nan)
+    for out, inside, *one in zip(result, *frames, strict=True):
+        frame = _JointFrame(one[:d], one[d:] if noisy else None, inside, model, max(fewest, model.degrees(d) + 1),
+                            stride, out)  # fmt: skip
         sweep(frame, (rows, columns), size, np.dtype(np.float64))
-    return result
+    kept = np.float32 if all(x.dtype == np.float32 for x in values) else np.float64
+    return (result + jacobian).astype(kept).reshape((*shape[:-2], *(-(-n // stride) for n in shape[-2:])))
+
+
+def each_of(name: str, given: Any, number: int) -> list[Any]:
+    """One for each image: those of a list, or the same for all."""
+    if not isinstance(given, list | tuple):
+        return [given] * number
+    if len(given) != number:
+        raise ValueError(f"{name} is a list of {len(given)} for {number} images; pass one for each, or one for all.")
+    return list(given)
