@@ -1,6 +1,6 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import contrast, conventions, datasets, phantoms
+from . import contrast, conventions, datasets, phantoms, texture
 from .bounds import cramer_rao_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
@@ -63,4 +63,5 @@ __all__ = [
     "simulate",
     "smooth_gauge",
     "summarise",
+    "texture",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import log, pi
 from typing import Any
@@ -141,9 +141,9 @@ class Angle(Distribution):
     r"""Angles of a given period, von Mises distributed: ``p(x) = e^{k cos f (x - m)} f / (2 pi I_0(k))``.
 
     With ``f = 2 pi / period``, C and S the sums of ``cos f x`` and ``sin f x`` over the n pixels of a window, the most
-    probable mean is ``arctan2(S, C) / f``, and the concentration that for which ``I_1(k) / I_0(k) = |C + i S| / n``. The
-    entropy of that density is too small by ``1 / n`` on average, half the number of fitted parameters over n, as that of
-    any exponential family. ``1 / (n - 1)`` is added, which leaves less than 0.001 nat from 25 pixels on.
+    probable mean is ``arctan2(S, C) / f``, and the concentration that for which ``I_1(k) / I_0(k) = |C + i S| / n``.
+    The entropy of that density is too small by ``1 / n`` on average, half the number of fitted parameters over n, as
+    that of any exponential family. ``1 / (n - 1)`` is added, which leaves less than 0.001 nat from 25 pixels on.
 
     Parameters
     ----------
@@ -152,9 +152,9 @@ class Angle(Distribution):
     Notes
     -----
     With noise of standard deviation s in a pixel, the mean of ``e^{i f x}`` over noise and tissue is that of the tissue
-    times ``w = e^{-f^2 s^2 / 2}``. Pixels are weighted with w, and ``R = |sum w e^{i f x}| / sum w^2`` is the resultant of
-    the tissue alone, without bias. The window is worth ``sum w^2`` pixels without noise. Where noise explains all of
-    the dispersion (R >= 1), the entropy of the tissue is minus infinity.
+    times ``w = e^{-f^2 s^2 / 2}``. Pixels are weighted with w, and ``R = |sum w e^{i f x}| / sum w^2`` is the resultant
+    of the tissue alone. The window is worth ``sum w^2`` pixels without noise. Where noise explains all of the
+    dispersion (R >= 1), the entropy of the tissue is minus infinity.
     """
 
     period: float = 2 * pi
@@ -300,4 +300,4 @@ class Rescaled(Distribution):
     def finish(self, sums: np.ndarray, spare: np.ndarray, noisy: bool, wanted: Wanted) -> Found:
         found = self.angle.finish(sums, spare, noisy, wanted)
         mean = None if found.expectation is None else found.expectation + self.centre
-        return found._replace(expectation=mean)
+        return replace(found, expectation=mean)

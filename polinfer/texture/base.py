@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ class Wanted(NamedTuple):
     entropy: bool
 
 
-class Found(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Found:
     """What a strip of windows gave, flat arrays; None where it was not wanted.
 
     ``count`` is the number of pixels, less where their noise makes them worth less than one; ``noise_entropy`` is None
@@ -60,6 +62,6 @@ class Distribution(ABC):
     def finish(self, sums: np.ndarray, spare: np.ndarray, noisy: bool, wanted: Wanted) -> Found:
         """Expectation and entropy of windows with these sums, shape (features, pixels).
 
-        ``sums`` and ``spare``, twice as large, may be overwritten and may be what is returned. Where there are too few pixels
-        the caller drops the result.
+        ``sums`` and ``spare``, twice as large, may be overwritten and may be what is returned. Where there are too few
+        pixels the caller drops the result.
         """

@@ -87,8 +87,8 @@ class Bounded(Distribution):
 def truncated_entropy(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Entropy in nats of the Gaussian truncated to [-1, 1] that has this mean and variance, element by element.
 
-    Absolute error below 1e-4. A variance above that of the exponential density with the same mean counts as that one;
-    minus infinity where the variance is 0.
+    Absolute error below 2e-4, mostly 1e-5. A variance above that of the exponential density with the same mean counts
+    as that one; minus infinity where the variance is 0.
     """
     from numpy.polynomial.chebyshev import chebvander
 
@@ -105,7 +105,10 @@ def truncated_entropy(mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _exponential_variance(mean: np.ndarray) -> np.ndarray:
-    """Variance of the density ``~ e^{b x}`` on [-1, 1] with this mean: ``1/b^2 - 1/sinh(b)^2`` at ``coth b - 1/b = mean``."""
+    """Variance of the density ``~ e^{b x}`` on [-1, 1] with this mean.
+
+    It is ``1/b^2 - 1/sinh(b)^2`` at ``coth b - 1/b = mean``.
+    """
     m = np.abs(mean)
     b = m * (3 - m**2) / (1 - m**2)
     for _ in range(8):
@@ -155,6 +158,8 @@ def _loss() -> np.ndarray:
         for _ in range(20):
             trial = slopes + size * step
             worse = moments(trial)[0] - np.sum(trial * target, axis=0) > height + 1e-13
+            if not worse.any():
+                break
             size[worse] *= 0.5
         slopes = slopes + size * step
         if np.abs(size * step).max() < 1e-10:

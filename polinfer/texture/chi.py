@@ -17,7 +17,7 @@ __all__ = ["Chi"]
 class Chi(Distribution):
     r"""Amplitudes: the length of a vector of ``degrees`` independent Gaussians of mean 0 and deviation s.
 
-    ``p(x) = 2 (x / s sqrt 2)^k e^{-x^2 / 2 s^2} / (x Gamma(k / 2))``, with k = ``degrees``, for x >= 0. One degree is the
+    ``p(x) = 2 (x / s sqrt 2)^k e^{-x^2 / 2 s^2} / (x Gamma(k / 2))``, with k = ``degrees``, x >= 0. One degree is the
     absolute value of a Gaussian, two are those of a complex Gaussian (Rayleigh). The most probable s^2 is the mean of
     ``x^2 / k``. Its logarithm, and s itself, are biased by factors that depend on n k only, known exactly: expectation
     and entropy are without bias for independent pixels.

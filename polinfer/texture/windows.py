@@ -31,7 +31,8 @@ class Sweep(ABC):
         """Take the sums of the windows around these rows, shape (features, pixels), and keep what is made of them.
 
         The pixels are those of a strip that is wider than the frame: column x of row y is ``y * width + x``, of which
-        the columns beyond the frame mean nothing. ``sums`` and ``spare``, shape (2 * features, pixels), may be overwritten.
+        the columns beyond the frame mean nothing. ``sums`` and ``spare``, shape (2 * features, pixels), may be
+        overwritten.
         """
 
 
