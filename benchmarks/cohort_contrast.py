@@ -36,12 +36,13 @@ SHAPE, SIGMA, SEED = (72, 72), 0.05, 1
 SIZE, OFFSET = 15, (0, 4)
 SIZES = (5, 9, 15, 21, 31)
 LENGTHS = (1, 2, 4, 8)
-DIRECTIONS = {"along": (0, 4), "down": (4, 0), "diagonal": (3, 3), "other diagonal": (3, -3)}
+DIRECTIONS = {"along": (0, 4), "down": (4, 0), "diagonal": (3, 3), "other diag.": (3, -3)}
 DISTRIBUTIONS = {
     "amplitude": filters.Chi(1), "phase": VonMises, "diattenuation": TruncatedNormal,
     "diattenuation_angle": AxialVonMises, "retardance": VonMises, "retardance_angle": AxialVonMises,
     "circularity": VonMises,
 }  # fmt: skip
+PAIRS = {"amplitude": filters.Rescaled(0.8, 1.0), "diattenuation": filters.Rescaled(0.0, 1.0)}  # in joint distributions
 PERIODS = {VonMises: 2 * np.pi, AxialVonMises: np.pi}
 METRICS = ("E", "H", "H less noise", "H(x, x')")
 
@@ -51,7 +52,7 @@ class Maps:
     """values, noise: of every quantity, (sample, y, x); mask: True = use; labels."""
 
     values: dict[str, np.ndarray]
-    noise: dict[str, np.ndarray | None]
+    noise: dict[str, np.ndarray]
     mask: np.ndarray
     labels: np.ndarray
 
@@ -65,26 +66,24 @@ def measured(seed: int, sigma: float = SIGMA) -> Maps:
     assert found.gain is not None
     spread = sigma / 2  # of real and imaginary part of a gain, from two balanced states and a J of norm sqrt 2
     values = {"amplitude": np.abs(found.gain), "phase": np.angle(found.gain)}
-    noise: dict[str, np.ndarray | None] = {"amplitude": None, "phase": spread / np.abs(found.gain)}
+    noise = {"amplitude": np.full(scene.labels.shape, spread), "phase": spread / np.abs(found.gain)}
     for name in Parameters._fields:
         values[name] = np.asarray(getattr(found.parameters, name))
-        noise[name] = np.asarray(getattr(found.std, name)) if name != "diattenuation" else None
+        noise[name] = np.asarray(getattr(found.std, name))
     lost = int(Status.NOT_CONVERGED | Status.NON_FINITE | Status.MASKED)
     return Maps(values, noise, (scene.labels != 3) & ((found.status & lost) == 0), scene.labels)
 
 
-def metric(maps: Maps, name: str, kind: str, size: int = SIZE, offset: tuple[int, int] = OFFSET) -> np.ndarray | None:
-    """One filtered map; None if the metric does not exist for the quantity."""
+def metric(maps: Maps, name: str, kind: str, size: int = SIZE, offset: tuple[int, int] = OFFSET) -> np.ndarray:
+    """One filtered map."""
     image, family = maps.values[name], DISTRIBUTIONS[name]
     if kind == "E":
         return filters.expectation(image, size=size, distribution=family, mask=maps.mask)
     if kind == "H":
         return filters.entropy(image, size=size, distribution=family, mask=maps.mask)
     if kind == "H less noise":
-        noise = maps.noise[name]
-        return None if noise is None else filters.entropy(
-            image, size=size, distribution=family, mask=maps.mask, std=noise
-        )  # fmt: skip
+        return filters.entropy(image, size=size, distribution=family, mask=maps.mask, std=maps.noise[name])
+    family = PAIRS.get(name, family)
     return 0.5 * filters.cooccurrence_entropy(image, size=size, distribution=family, mask=maps.mask, offset=offset)
 
 
@@ -107,8 +106,6 @@ def figure_of_metrics(found: dict[tuple[str, str], dict[str, Any]]) -> Any:
     for axes, which in zip(figure.subplots(2, 1, sharex=True), ("cnr", "gcnr"), strict=True):
         for k, kind in enumerate(METRICS):
             for place, name in enumerate(DISTRIBUTIONS):
-                if (name, kind) not in found:
-                    continue
                 one, x = found[name, kind][which], place + (k - 1.5) * 0.2
                 axes.bar(x, one.value, 0.18, color=f"C{k}", label=kind if place == 1 else None)
                 axes.plot([x, x], [one.low, one.high], color="0.2", lw=1)
@@ -132,7 +129,7 @@ def figure_of_sweeps(rows: list[dict[str, Any]]) -> Any:
         axes.fill_between(x, [p["low"] for p in points], [p["high"] for p in points], color="0.85")
         axes.plot(x, [p["cnr"] for p in points], "ko-")
         if swept == "direction":
-            axes.set_xticks(x, [str(p["setting"]) for p in points], fontsize=8)
+            axes.set_xticks(x, [str(p["setting"]) for p in points], fontsize=7)
         axes.set_xlabel({"window": "side of the window (pixels)", "length": "offset length (pixels)",
                          "direction": "direction of the offset"}[swept])  # fmt: skip
         axes.grid(alpha=0.3)
@@ -149,21 +146,19 @@ def main() -> None:
     for name, family in DISTRIBUTIONS.items():
         for kind in METRICS:
             image = metric(maps, name, kind)
-            if image is None:
-                continue
             period = PERIODS.get(family) if kind == "E" else None  # type: ignore[call-overload]
             found[name, kind] = contrasts(image, maps, period)
             cnr, gcnr = found[name, kind]["cnr"], found[name, kind]["gcnr"]
             results.add(quantity=name, metric=kind, cnr=cnr.value, low=cnr.low, high=cnr.high, gcnr=gcnr.value,
                         gcnr_low=gcnr.low, gcnr_high=gcnr.high)  # fmt: skip
-    fold = contrasts(np.asarray(metric(maps, "phase", "H")), maps, None, (0, 2))
+    fold = contrasts(metric(maps, "phase", "H"), maps, None, (0, 2))
     print(f"phase entropy of folds against healthy tissue: CNR {fold['cnr']}, gCNR {fold['gcnr']}")
     settings = [("window", n, n, OFFSET) for n in SIZES]
     settings += [("length", n, SIZE, (0, n)) for n in LENGTHS]
     settings += [("direction", name, SIZE, offset) for name, offset in DIRECTIONS.items()]  # type: ignore[misc]
     rows = []
     for swept, setting, size, offset in settings:
-        one = contrasts(np.asarray(metric(maps, "phase", "H(x, x')", size, offset)), maps, None)["cnr"]
+        one = contrasts(metric(maps, "phase", "H(x, x')", size, offset), maps, None)["cnr"]
         rows.append({"swept": swept, "setting": setting, "cnr": one.value, "low": one.low, "high": one.high})
         results.add(**rows[-1])
     for swept in ("window", "length", "direction"):
