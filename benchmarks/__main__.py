@@ -1,4 +1,5 @@
-"""Run benchmarks: ``python -m benchmarks [NAME ...]``; without names, all that take under ten minutes together."""
+"""Run benchmarks: ``python -m benchmarks [NAME ...]``; without names, those that take minutes, not hours: some
+twenty together."""
 
 from __future__ import annotations
 

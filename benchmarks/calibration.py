@@ -1,4 +1,4 @@
-"""Do posteriors hold what they say? Simulation-based calibration of both samplers.
+"""Do posteriors hold what they say? Simulation-based calibration of ``Gibbs``.
 
 Truths from the priors, data from the truths, ranks of the truths among the draws, for functions that the equivalent
 sets share. Uniform ranks: chi-square tests in 20 bins, the smallest p-value times the number of tests against 0.01.

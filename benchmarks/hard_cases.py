@@ -19,8 +19,9 @@ Unless a case says otherwise: truths from the priors, balanced states, amplitude
     ``rms_oracle`` counts, the same over the error of the oracle's maximum, which contains the prior.
 ``wrong``: pixels whose status is not what is expected. MASKED and NON_FINITE: exactly the pixels made so.
     NOT_CONVERGED: none. AT_EDGE: where the reported D or (unit gain) eta is a bound to within rounding (eight eps;
-    between that and 1e-9 of the range, 1e-5 in single precision, either is right); where the truth is on one and D can
-    be told from it, in half of the pixels (unit gain: a free phase takes up the sign of the weaker transmission).
+    between that and 1e-9 of the range, 1e-5 in single precision, either is right); where the oracle's maximum is on
+    one, in the pixels that it has, and nowhere else; where the truth is on one and D can be told from it, in half of
+    the pixels (unit gain: a free phase takes up the sign of the weaker transmission).
     BAD_FIT: exactly where the oracle's chi-square at the reported point has a tail probability below the nominal one,
     and in an expected share of the pixels. UNIDENTIFIED: exactly where the standard deviation from the oracle's second
     derivatives exceeds half of that of a uniform one, off the bounds and where that matrix is definite; all of them in
@@ -55,6 +56,7 @@ GAINS = {"unit": None, "complex": ComplexGain(1.0)}
 DEFICIT = {"complex128": 1e-3, "complex64": 1e-2}
 UNIDENTIFIED = sum(int(Status.unidentified(name)) for name in Parameters._fields)
 RANGE = np.array([2.0, pi, 2 * pi, pi, 2 * pi]) / np.sqrt(12)
+EXACT = 8 * np.finfo(np.float64).eps  # an oracle's maximum so near to a bound lies on it
 SLACK = {"complex128": 0.02, "complex64": 0.1}  # of a threshold, within which rounding decides
 # from a bound, of the range: AT_EDGE is right up to the second, and must be set up to the first
 ROUNDING = {"complex128": (8 * np.finfo(np.float64).eps, 1e-9), "complex64": (8 * np.finfo(np.float32).eps, 1e-5)}
@@ -176,18 +178,29 @@ def cast(measurement: Measurement, dtype: str) -> Measurement:
     return replace(measurement, illumination=measurement.illumination.astype(dtype), response=response)
 
 
+def from_edge(point: np.ndarray, gain: str) -> np.ndarray:
+    """Distance of points ``(5, pixels)`` from the nearest bound, as a share of the range from its middle."""
+    away = 1 - np.abs(point[0])
+    return away if gain != "unit" else np.minimum(away, 1 - np.abs(point[2]) / pi)
+
+
 def status_errors(case: Case, model: Model, gain: str, scene: Scene, result: Fit, point: np.ndarray, dtype: str,
-                  response: np.ndarray) -> dict[str, int]:  # fmt: skip
-    """Number of pixels with a wrong bit, by bit; ``response`` as the fit was given it, of the states used."""
+                  response: np.ndarray, peak: np.ndarray) -> dict[str, int]:  # fmt: skip
+    """Number of pixels with a wrong bit, by bit; ``response`` as the fit was given it, of the states used.
+
+    ``peak`` are the oracle's maxima of the first good pixels.
+    """
     status, good, oracle = result.status, scene.good, Oracle(type(model.ordering).__name__, gain)
     wrong = {"MASKED": np.sum(((status & Status.MASKED) != 0) != scene.masked),
              "NON_FINITE": np.sum(((status & Status.NON_FINITE) != 0) != scene.non_finite)}  # fmt: skip
     status, point = status[good], point[:, good]
     states, response = scene.states[good], response[good]
     wrong["NOT_CONVERGED"] = np.sum((status & Status.NOT_CONVERGED) != 0)
-    away = 1 - np.abs(point[0]) if gain != "unit" else np.minimum(1 - np.abs(point[0]), 1 - np.abs(point[2]) / pi)
+    away, expected_away = from_edge(point, gain), from_edge(peak, gain)
     flagged, (surely, rounding) = (status & Status.AT_EDGE) != 0, ROUNDING[dtype]
     wrong["AT_EDGE"] = np.sum(flagged & (away > rounding)) + np.sum(~flagged & (away < surely))
+    first = flagged[: len(expected_away)]
+    wrong["AT_EDGE"] += np.sum(first & (expected_away > rounding)) + np.sum(~first & (expected_away < EXACT))
     # |D| is 1 - O(sigma^2) beside the bound
     wrong["AT_EDGE"] += misplaced(flagged, 0.5) * (gain in case.edge and case.sigma**2 > 4 * rounding)
     chi = chi_square(model, oracle, point, response, states, case.sigma)
@@ -281,7 +294,7 @@ def rows_of(case: Case, model: Model, gain: str, pixels: int, checked: int, star
         row = {"case": case.name, "ordering": type(model.ordering).__name__, "gain": gain, "dtype": dtype,
                "sigma": case.sigma, "deficit": float(deficit.max()), "raw": float(raw.max())}  # fmt: skip
         row |= _errors(case, model, scene, point, few, peak)
-        wrong = status_errors(case, model, gain, scene, result, point, dtype, response)
+        wrong = status_errors(case, model, gain, scene, result, point, dtype, response, peak)
         nan, flagged = nan_counts(result)
         text = ", ".join(f"{name} {count}" for name, count in wrong.items() if count) or "-"
         yield row | {"ok_percent": float(100 * np.mean(result.status == 0)), "nan": nan, "nan_flagged": flagged,

@@ -9,7 +9,9 @@ import jax
 
 # The library never decides about precision; its tests run in double unless told otherwise.
 jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != "0")
-# Compiling dominates the time of a run, and the processes of a run need the same code.
+# Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
+# otherwise, and the processes of a run share what they compile.
+jax.config.update("jax_disable_most_optimizations", os.environ.get("POLINFER_TEST_OPTIMISED", "0") == "0")
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -40,12 +40,12 @@ from tests.polinfer.scenes import (
 @pytest.mark.parametrize(
     ("ordering", "gain", "u", "sigma"),
     [
-        ("retarder_first", "none", BALANCED, 0.4),
-        ("retarder_first", "phase", BALANCED, 0.2),
         ("retarder_first", "complex", BALANCED, 0.1),
         ("polariser_first", "none", UNBALANCED, 0.3),
         ("polariser_first", "phase", UNBALANCED, 0.4),
-        ("polariser_first", "complex", UNBALANCED, 0.05),
+        pytest.param("retarder_first", "none", BALANCED, 0.4, marks=pytest.mark.slow),
+        pytest.param("retarder_first", "phase", BALANCED, 0.2, marks=pytest.mark.slow),
+        pytest.param("polariser_first", "complex", UNBALANCED, 0.05, marks=pytest.mark.slow),
     ],
 )
 def test_no_scipy_optimiser_from_many_starts_finds_a_better_point(ordering, gain, u, sigma):
@@ -69,7 +69,7 @@ def test_no_scipy_optimiser_from_many_starts_finds_a_better_point(ordering, gain
         assert ours >= best - 1e-6
 
 
-@pytest.mark.parametrize("gain", ["none", "phase", "complex"])
+@pytest.mark.parametrize("gain", ["none", pytest.param("phase", marks=pytest.mark.slow), "complex"])
 def test_hard_corners_converge_and_are_never_nan_where_ok(gain):
     grid = np.array(np.meshgrid([0.0, 1e-3, 0.5, 1.0], [0.0, np.pi / 2], [0.0, 1e-3, np.pi - 1e-3, np.pi],
                                 [0.0, np.pi / 4, np.pi / 2], [0.0, np.pi]))  # fmt: skip

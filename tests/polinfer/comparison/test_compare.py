@@ -209,6 +209,7 @@ def test_table_and_picture_say_what_was_found():
     assert weak.scene.reason in weak.table()
 
 
+@pytest.mark.slow  # three models to compile
 def test_unbalanced_states_and_no_diattenuation_need_the_model_that_the_orderings_have_in_common():
     """Volumes differ between the orderings, and pooled over 972 pixels this passes for evidence; a note says so."""
     skew = np.array([[1, 1, 1], 0.2 * np.exp(2j * np.pi * np.arange(3) / 3)]) / 2**0.5
