@@ -10,7 +10,19 @@ import inspect
 import jax
 
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
-ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "posterior", "calibration", "texture")
+ALL = (
+    *QUICK,
+    "peers",
+    "chain",
+    "parts",
+    "hard_cases",
+    "ordering",
+    "posterior",
+    "calibration",
+    "texture",
+    "contrast",
+    "cohort_contrast",
+)
 
 
 def main() -> None:

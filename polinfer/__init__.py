@@ -1,6 +1,6 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import conventions, datasets, phantoms, texture
+from . import contrast, conventions, datasets, phantoms, texture
 from .bounds import cramer_rao_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
@@ -45,6 +45,7 @@ __all__ = [
     "calibration_ranks",
     "canonicalise",
     "compare",
+    "contrast",
     "conventions",
     "cramer_rao_bound",
     "datasets",

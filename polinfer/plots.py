@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
+    from .phantoms import Phantom
     from .sampling.summaries import Summary
 
-__all__ = ["colour_circle", "draw_map", "explain", "plot_fit", "plot_summary", "two_rows"]
+__all__ = ["colour_circle", "draw_map", "explain", "plot_fit", "plot_phantom", "plot_summary", "two_rows"]
 
 TITLES = Parameters(
     "diattenuation", "diattenuation angle (°)", "retardance (°)", "retardance angle (°)", "circularity (°)"
@@ -260,3 +261,73 @@ def plot_summary(summary: Summary, smooth: bool = False, pixel_size: float | Non
     grey = _draw_parameters(axes[:, 1:], parameters, summary.std, status, pixel_size)
     explain(figure, grey, bool(lost.any()), smooth)
     return figure
+
+
+def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
+    """Maps of what is true in a phantom: amplitude, phase, the five parameters, tilt if there is one, regions.
+
+    A row for each frame of a series. Angles are in degrees, in colours that close on themselves.
+
+    Parameters
+    ----------
+    phantom: of shape (y, x) or (frame, y, x). pixel_size: side of a pixel, metres, > 0, for a scale bar below every
+        map; None: no bar.
+
+    Raises
+    ------
+    TypeError, ValueError: not a phantom, another shape, a pixel size out of range.
+
+    >>> import polinfer
+    >>> figure = plot_phantom(polinfer.phantoms.half_wave_plate((6, 6), [0.0, 0.3]), pixel_size=9e-6)
+    >>> [axes.get_title() for axes in figure.axes][:3]
+    ['amplitude', 'phase (°)', 'diattenuation']
+    """
+    from matplotlib.figure import Figure
+
+    from .phantoms import Phantom
+
+    one_of_types("phantom", phantom, (Phantom,), "pass one of polinfer.phantoms.")
+    if phantom.labels.ndim not in (2, 3):
+        raise ValueError(f"phantom must have shape (y, x) or (frame, y, x) to be drawn, got {phantom.labels.shape}.")
+    if pixel_size is not None:
+        pixel_size = real_number("pixel_size", pixel_size, above=0)
+    frames = [phantom] if phantom.labels.ndim == 2 else [phantom[i] for i in range(len(phantom))]
+    several = int(phantom.labels.max(initial=0)) > 0
+    columns = 7 + (phantom.tilt is not None) + several
+    high, wide = frames[0].labels.shape
+    height = min(max(2.2 * high / wide, 0.7), 3.0) + (0.3 if pixel_size is None else 0.5)
+    figure = Figure(figsize=(2.9 * columns, height * len(frames) + 0.2), layout="constrained")
+    for row, frame in zip(figure.subplots(len(frames), columns, squeeze=False), frames, strict=True):
+        maps: list[tuple[str, Any, float | None]] = [
+            ("amplitude", np.abs(frame.gain), None),
+            ("phase (°)", np.degrees(np.angle(frame.gain)), 360.0),
+        ]
+        for name, value in zip(Parameters._fields, frame.parameters, strict=True):
+            unit, period = (1.0, None) if name == "diattenuation" else (180 / pi, 180 / pi * getattr(PERIODS, name))
+            maps.append((getattr(TITLES, name), unit * value, period))
+        if frame.tilt is not None:
+            maps.append(("tilt (°)", np.degrees(np.angle(np.exp(1j * frame.tilt))), 360.0))
+        for axes, (title, value, period) in zip(row, maps, strict=False):
+            draw_map(axes, title, value, np.zeros((high, wide), bool), period, pixel_size=pixel_size)
+        if several:
+            _draw_regions(row[-1], frame.labels, int(phantom.labels.max()), phantom.names, pixel_size)
+    return figure
+
+
+def _draw_regions(axes: Any, labels: np.ndarray, top: int, names: tuple[str, ...], pixel_size: float | None) -> None:
+    """Map of labels, one colour for each, with its legend."""
+    import matplotlib
+    from matplotlib.patches import Patch
+
+    colours = matplotlib.colors.ListedColormap([matplotlib.colormaps["tab20"](k % 20) for k in range(top + 1)])
+    axes.imshow(labels, cmap=colours, vmin=-0.5, vmax=top + 0.5, interpolation="nearest")
+    axes.set_title("regions", fontsize=9)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    called = names or tuple(str(k) for k in range(top + 1))
+    axes.legend(
+        handles=[Patch(color=colours(k), label=called[k]) for k in range(top + 1)], loc="upper left",
+        bbox_to_anchor=(1.0, 1.0), fontsize=7, frameon=False,
+    )  # fmt: skip
+    if pixel_size is not None:
+        _scale_bar(axes, labels.shape[1], pixel_size)

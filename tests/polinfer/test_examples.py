@@ -37,3 +37,13 @@ def test_measured_fibre(tmp_path):
     fibre_folder()
     assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)
     assert (tmp_path / "measured_fibre.png").stat().st_size > 10_000
+
+
+def test_phantoms(tmp_path):
+    assert "stretched gel" in run("05_phantoms.py", tmp_path)
+    assert (tmp_path / "speckle.png").stat().st_size > 10_000
+
+
+def test_contrast(tmp_path):
+    assert "gCNR" in run("06_contrast.py", tmp_path)
+    assert (tmp_path / "contrast.png").stat().st_size > 10_000
