@@ -174,8 +174,12 @@ class Angle(Distribution):
         # concentration 500: 1 - R^2 is 0.002, and rounding 2e-7 in it is 1e-4 nat
         return 0.5 * log(2 * pi / 500) + 0.5 - log(self.frequency)
 
-    def check(self, name: str, values: np.ndarray) -> None:
-        """Every angle is in some period."""
+    def outside(self, values: np.ndarray) -> np.ndarray | None:  # noqa: ARG002
+        return None
+
+    @property
+    def allowed(self) -> str:
+        return "any"
 
     def features(self, noisy: bool) -> int:
         return 5 if noisy else 3
@@ -200,7 +204,7 @@ class Angle(Distribution):
         cosine, sine, count = sums[0], sums[1], sums[2]
         entropy = mean = noise = None
         if noisy:
-            # cos and sin of the noise are not equally likely to be missed: mean squares of the weights
+            # mean of the squared resultant of the noise, w^2, over pixels that count w^2
             kept = sums[3] / count
             noise = von_mises_noise(kept) - log(self.frequency)
         if wanted.entropy:
@@ -281,15 +285,12 @@ class Rescaled(Distribution):
         """The distribution of ``x - centre``."""
         return Angle(2 * pi * self.scale)
 
-    def check(self, name: str, values: np.ndarray) -> None:
-        reach = 0.5 * pi * self.scale
-        with np.errstate(invalid="ignore"):
-            outside = np.abs(values - self.centre) > reach
-        if np.any(outside):
-            raise ValueError(
-                f"{name} has {int(outside.sum())} values farther than pi scale / 2 = {reach:g} from the centre "
-                f"{self.centre:g} of Rescaled; choose a larger scale or mask them."
-            )
+    def outside(self, values: np.ndarray) -> np.ndarray | None:
+        return np.asarray(np.abs(values - self.centre) > 0.5 * pi * self.scale)
+
+    @property
+    def allowed(self) -> str:
+        return f"within pi scale / 2 = {0.5 * pi * self.scale:g} of {self.centre:g}; choose a larger scale or mask them"
 
     def features(self, noisy: bool) -> int:
         return self.angle.features(noisy)

@@ -43,8 +43,13 @@ class Distribution(ABC):
     single_floor: float = -np.inf  # entropy below which they will not
 
     @abstractmethod
-    def check(self, name: str, values: np.ndarray) -> None:
-        """Raise ValueError if a pixel (NaN: none) lies where the density is 0."""
+    def outside(self, values: np.ndarray) -> np.ndarray | None:
+        """Which values (not NaN) the distribution cannot have; None: it can have all."""
+
+    @property
+    @abstractmethod
+    def allowed(self) -> str:
+        """The values that it can have, in words, and what to do with others."""
 
     @abstractmethod
     def features(self, noisy: bool) -> int:

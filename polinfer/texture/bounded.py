@@ -43,14 +43,14 @@ class Bounded(Distribution):
         if not self.low < self.high:
             raise ValueError(f"low must be < high, got low {self.low:g} and high {self.high:g}; swap them.")
 
-    def check(self, name: str, values: np.ndarray) -> None:
-        with np.errstate(invalid="ignore"):
-            outside = (values < self.low) | (values > self.high)
-        if np.any(outside):
-            raise ValueError(
-                f"{name} has {int(outside.sum())} values outside [{self.low:g}, {self.high:g}], where a truncated "
-                "Gaussian is 0; pass Bounded(low, high) with the bounds of the values."
-            )
+    def outside(self, values: np.ndarray) -> np.ndarray | None:
+        return np.asarray((values < self.low) | (values > self.high))
+
+    @property
+    def allowed(self) -> str:
+        return (
+            f"from {self.low:g} to {self.high:g}; pass Bounded(low, high) with the bounds of the values, or mask them"
+        )
 
     @property
     def _unit(self) -> float:

@@ -37,10 +37,12 @@ class Chi(Distribution):
     def __post_init__(self) -> None:
         object.__setattr__(self, "degrees", integer("degrees", self.degrees, low=1))
 
-    def check(self, name: str, values: np.ndarray) -> None:
-        with np.errstate(invalid="ignore"):
-            if np.any(values < 0):
-                raise ValueError(f"{name} must be >= 0 for Chi, got {float(np.nanmin(values)):g}; pass an amplitude.")
+    def outside(self, values: np.ndarray) -> np.ndarray | None:
+        return np.asarray(values < 0)
+
+    @property
+    def allowed(self) -> str:
+        return ">= 0; pass an amplitude"
 
     def features(self, noisy: bool) -> int:
         return 3 if noisy else 2

@@ -12,7 +12,7 @@ from .base import Distribution, Wanted
 from .families import distribution_of
 from .windows import Sweep, sweep
 
-__all__ = ["broadcast_to", "checked_size", "filtered"]
+__all__ = ["broadcast_to", "check_range", "checked_size", "filtered"]
 
 
 class _Frame(Sweep):
@@ -79,7 +79,7 @@ def filtered(
     fewest = integer("fewest", fewest, low=3)
     used = None if mask is None else broadcast_to("mask", boolean_array("mask", mask), values.shape)
     noise = None if std is None else broadcast_to("std", real_array("std", std, low=0), values.shape)
-    family.check("image", values if used is None else np.where(used, values, np.nan))
+    check_range("image", values, used, family)
     kept = values.dtype if values.dtype in (np.float32, np.float64) else np.dtype(np.float64)
     if noise is not None:
         names = (*names, "noise_entropy") if "count" in names else names
@@ -91,6 +91,22 @@ def filtered(
         filled = {name: _frame(x, number) for name, x in maps.items()}
         _Frame(own, widths, inside, family, fewest, filled).run(size)
     return maps
+
+
+def check_range(name: str, values: np.ndarray, used: np.ndarray | None, family: Distribution) -> None:
+    """Raise ValueError if a pixel that counts lies where the distribution has none."""
+    with np.errstate(invalid="ignore"):
+        outside = family.outside(values)
+    if outside is None:
+        return
+    if used is not None:
+        outside = outside & used
+    outside &= np.isfinite(values)
+    if np.any(outside):
+        raise ValueError(
+            f"{name} has {int(outside.sum())} values, such as {float(values[outside][0]):g}, that are impossible for "
+            f"{type(family).__name__}: they must be {family.allowed}."
+        )
 
 
 def _frame(values: np.ndarray, number: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from ..checks import boolean_array, integer, one_of_types, real_array
 from ..neighbours import plane
 from .angles import Angle, Rescaled
 from .base import Distribution
-from .frames import broadcast_to, checked_size
+from .frames import broadcast_to, check_range, checked_size
 from .joint import Joint, score_matching, terms
 from .quadrature import joint_entropy
 from .windows import Sweep, sweep
@@ -121,7 +121,7 @@ def joint_filtered(
         if not isinstance(angle, Angle):
             raise TypeError(f"distribution of images[{i}] is {family!r}: joint distributions are of angles; pass "
                             "Rescaled(centre, scale) for what is none.")  # fmt: skip
-        family.check(f"images[{i}]", np.where(used, x, np.nan))
+        check_range(f"images[{i}]", x, used, family)
         centre = family.centre if isinstance(family, Rescaled) else 0.0
         angles.append(angle.frequency * (x.astype(float) - centre))
         jacobian -= log(angle.frequency)

@@ -239,9 +239,9 @@ def test_pixels_whose_noise_has_no_width_are_left_out():
         ({"std": -np.ones((9, 9))}, ValueError, "std must be >= 0"),
         ({"distribution": "von mises"}, TypeError, "distribution must be one of the classes VonMises"),
         ({"distribution": VonMises(0, 1)}, TypeError, "distribution must be"),
-        ({"distribution": TruncatedNormal}, ValueError, "outside"),
-        ({"distribution": Chi(1), "image": -np.ones((9, 9))}, ValueError, "must be >= 0 for Chi"),
-        ({"distribution": Rescaled(0.0, 1.0)}, ValueError, "farther than"),
+        ({"distribution": TruncatedNormal}, ValueError, "impossible for Bounded: they must be from -1 to 1"),
+        ({"distribution": Chi(1), "image": -np.ones((9, 9))}, ValueError, "impossible for Chi: they must be >= 0"),
+        ({"distribution": Rescaled(0.0, 1.0)}, ValueError, "impossible for Rescaled: they must be within"),
         ({"image": np.ones((9, 9), complex)}, TypeError, "image must be real"),
     ],
 )
