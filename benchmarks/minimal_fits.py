@@ -112,19 +112,19 @@ def _product(row: list[Any], r: list[list[Any]], k: int) -> tuple[Any, Any]:
     return sum(a[0] * b[0] - a[1] * b[1] for a, b in pairs), sum(a[0] * b[1] + a[1] * b[0] for a, b in pairs)
 
 
-def _derivatives(element: str, scene: Any, balanced: bool, data: Data, point: Point, at: Any) -> climb.Posterior:
+def _derivatives(element: str, scene: Any, balanced: bool, data: Data, point: Point, at: Any) -> climb.Posterior:  # noqa: ARG001
     assert balanced
     assert scene.likelihood == NoGain()
     v, dv, angles = _vectors(element, point)
     g = _components(element, data.product)
     gradient = {i: 2 * dot(g, dv[i,]) for i in angles}
     hessian = {(angles[0], angles[0]): -2 * dot(g, v)} | {key: 2 * dot(g, x) for key, x in dv.items() if len(key) == 2}
-    return climb.Posterior(gradient, hessian, at)
+    return climb.Posterior(gradient, hessian)
 
 
 def _closed_form(element: str, scene: Any, data: Data) -> Point:
     v = _components(element, data.jones)
-    known: list[Any] = [None if pair is None else tuple(jnp.full_like(v[0], x) for x in pair) for pair in scene.fixed]
+    known: tuple[Any, ...] = scene.fixed
     if element == "retarder":
         flip = jnp.where(v[2] < 0, -1.0, 1.0).astype(v[0].dtype)
         rho = flip * jnp.sqrt(v[2] * v[2] + v[3] * v[3])
@@ -167,9 +167,8 @@ def _block(
     data = prepare(True, root, y, residual, constant, one)
     with ExitStack() as stack:
         if leave.element is not None:
-            for module in (climb, describe):
-                stack.enter_context(patch.object(module, "evaluate", partial(_evaluate, leave.element)))
-                stack.enter_context(patch.object(module, "derivatives", partial(_derivatives, leave.element)))
+            stack.enter_context(patch.object(climb, "evaluate", partial(_evaluate, leave.element)))
+            stack.enter_context(patch.object(climb, "derivatives", partial(_derivatives, leave.element)))
             stack.enter_context(patch.object(kernel, "closed_form", partial(_closed_form, leave.element)))
         return kernel._finish(scene, True, data, start, given, iterations)
 

@@ -31,10 +31,13 @@ def seconds(function: Callable[[], Any]) -> float:
 
 
 def alternating_seconds(functions: dict[str, Callable[[], Any]], repeats: int = 5) -> dict[str, np.ndarray]:
-    """Wall times of several functions that take turns, so that a slow spell of the machine hits all of them."""
+    """Wall times of several functions that take turns, so that a slow spell of the machine hits all of them.
+
+    Every other round is in reverse: who comes first finds the memory as the last of the round before left it.
+    """
     times: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(repeats):
-        for name, function in functions.items():
+    for k in range(repeats):
+        for name, function in list(functions.items())[:: -1 if k % 2 else 1]:
             times[name].append(seconds(function))
     return {name: np.array(values) for name, values in times.items()}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,12 @@ from .degeneracy import canonicalise
 from .neighbours import Window, box_mean
 from .orderings import Ordering, PolariserFirst, RetarderFirst
 from .records import Parameters
+from .threads import each
 
 __all__ = ["decompose", "ordering_error"]
+
+CHUNK = 8192  # matrices whose intermediate results stay in the processor's cache
+MARGIN = 1e-9  # far more than rounding
 
 
 def decompose(jones: Any, ordering: Ordering, neighbours: Window | None = None) -> Parameters:
@@ -43,16 +48,62 @@ def decompose(jones: Any, ordering: Ordering, neighbours: Window | None = None) 
     [0.3, 0.4, 1.0, 0.6, 0.2]
     """
     one_of_types("ordering", ordering, (Ordering,), "pass an instance such as RetarderFirst().")
-    matrices = complex_array("jones", jones, trailing=(2, 2))
+    matrices = np.ascontiguousarray(complex_array("jones", jones, trailing=(2, 2)))
     real_type = np.zeros((), matrices.dtype).real.dtype
     if neighbours is not None:
         one_of_types("neighbours", neighbours, (Window,), "pass Window(rows, columns) or None.")
         matrices = box_mean(matrices, neighbours, trailing=2)
-    useful = np.isfinite(matrices).all(axis=(-1, -2)) & (np.abs(matrices) > 0).any(axis=(-1, -2))
-    found = ordering.decompose(np.where(useful[..., None, None], matrices.astype(np.complex128), np.eye(2)))
-    if found is None:
+    if ordering.decompose(np.eye(2, dtype=complex)) is None:
         raise ValueError(f"ordering {type(ordering).__name__} has no closed form; use fit.")
-    return Parameters(*(np.where(useful, x, np.nan).astype(real_type) for x in canonicalise(found)))
+    shape = matrices.shape[:-2]
+    flat = matrices.reshape(-1, 2, 2)
+    out = np.empty((5, len(flat)), real_type)
+
+    def work(begin: int) -> None:
+        part = slice(begin, begin + CHUNK)
+        out[:, part] = _decompose(flat[part], ordering)
+
+    each(work, range(0, len(flat), CHUNK))
+    return Parameters(*out.reshape(5, *shape))
+
+
+def _decompose(matrices: np.ndarray, ordering: Ordering) -> np.ndarray:
+    """Canonical parameters ``(5, pixels)`` of matrices ``(pixels, 2, 2)``."""
+    size = np.sum(np.abs(matrices.view(matrices.real.dtype).reshape(-1, 8)), axis=-1, dtype=float)
+    useless = ~(np.isfinite(size) & (size > 0))
+    if useless.any():
+        matrices = np.where(useless[:, None, None], np.eye(2), matrices)
+    found = ordering.decompose(matrices)
+    assert found is not None
+    values, unsure = _canonical(np.stack([np.asarray(x, float) for x in found]))
+    if unsure.any():
+        values[:, unsure] = canonicalise(Parameters(*(np.asarray(x)[unsure] for x in found)))
+    values[:, useless] = np.nan
+    return values
+
+
+def _canonical(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What :func:`polinfer.canonicalise` makes of D and eta >= 0 and theta_eta in [0, pi/2], and where it is not sure.
+
+    Of such values the copies are antipodal in each angle, so the choice is one of signs. Next to a tie or to an end of
+    a range rounding may decide.
+    """
+    d, axis, eta, angle, xi = values
+    # how far 2 theta_D is from pi/2 on the circle; from the other copy it is pi less that
+    apart = pi - np.abs(np.abs(2 * axis - 0.5 * pi) - pi)
+    gain = 4 * d - pi * (2 * apart - pi)  # squared distance of the other copy less that of this one
+    stays, flips = gain > 0, np.abs(xi) > 0.5 * pi
+    axis = np.where(stays, axis, axis - np.copysign(0.5 * pi, axis))
+    found = [
+        np.where(stays, d, -d),
+        axis,
+        np.where(flips, -eta, eta),
+        np.where(flips, 0.5 * pi - angle, angle),
+        np.where(flips, xi - np.copysign(pi, xi), xi),
+    ]
+    sure = (d >= 0) & (eta >= 0) & (eta <= pi) & (angle > MARGIN) & (angle < 0.5 * pi - MARGIN)
+    sure &= (np.abs(gain) > MARGIN) & (np.abs(axis) < 0.5 * pi - MARGIN) & (np.abs(np.abs(xi) - 0.5 * pi) > MARGIN)
+    return np.stack(found) + 0, ~sure  # 0 in place of -0
 
 
 def ordering_error(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:

@@ -197,7 +197,10 @@ def _assemble(model: Model, prepared: Prepared, sigma: np.ndarray | None, parts:
     real_type = parts[0].covariance.dtype if parts else np.dtype(float)
 
     def spread(values: list[np.ndarray], dtype: np.dtype | type, tail: tuple[int, ...] = ()) -> np.ndarray:
-        frame = np.full((int(np.prod(shape)), *tail), np.nan, dtype)
+        count = int(np.prod(shape))
+        if values and len(good) == count:
+            return np.concatenate(values).astype(dtype, copy=False).reshape((*shape, *tail))
+        frame = np.full((count, *tail), np.nan, dtype)
         if values:
             frame[good] = np.concatenate(values)
         return frame.reshape((*shape, *tail))

@@ -10,7 +10,7 @@ import numpy as np
 from ..elements import multiply, polariser, retarder
 from ..records import Parameters
 from .base import Ordering
-from .closed_form import diattenuator_of, retarder_of
+from .closed_form import diattenuator_of, elements, retarder_of
 
 __all__ = ["PolariserFirst"]
 
@@ -31,5 +31,7 @@ class PolariserFirst(Ordering):
         )
 
     def decompose(self, jones: np.ndarray) -> Parameters:
-        diattenuation, angle, matrix = diattenuator_of(np.conj(np.swapaxes(jones, -1, -2)) @ jones)
-        return Parameters(diattenuation, angle, *retarder_of(jones @ matrix))
+        # J^H J is the conjugate of J^T (J^T)^H, of which D and its axis are the same; J A is the transpose of A J^T
+        turned = elements(jones).transposed
+        diattenuation, angle, polariser = diattenuator_of(turned)
+        return Parameters(diattenuation, angle, *retarder_of(polariser.times(turned).transposed))

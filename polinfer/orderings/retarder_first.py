@@ -10,7 +10,7 @@ import numpy as np
 from ..elements import multiply, polariser, retarder
 from ..records import Parameters
 from .base import Ordering
-from .closed_form import diattenuator_of, retarder_of
+from .closed_form import diattenuator_of, elements, retarder_of
 
 __all__ = ["RetarderFirst"]
 
@@ -31,5 +31,6 @@ class RetarderFirst(Ordering):
         )
 
     def decompose(self, jones: np.ndarray) -> Parameters:
-        diattenuation, angle, matrix = diattenuator_of(jones @ np.conj(np.swapaxes(jones, -1, -2)))
-        return Parameters(diattenuation, angle, *retarder_of(matrix @ jones))
+        matrix = elements(jones)
+        diattenuation, angle, polariser = diattenuator_of(matrix)
+        return Parameters(diattenuation, angle, *retarder_of(polariser.times(matrix)))

@@ -41,7 +41,12 @@ class AxialVonMises(Prior):
 
     def log_density(self, x: Any) -> jax.Array:
         shifted = -2 * jnp.sin(jnp.asarray(x) - self.mean) ** 2
-        return self.concentration * shifted - log(pi) - log(i0e(self.concentration))
+        return self.concentration * shifted + self.log_peak
+
+    @property
+    def log_peak(self) -> float:
+        """Log density at the mean."""
+        return -log(pi) - log(i0e(self.concentration))
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         angle = 0.5 * np.asarray(rng.vonmises(0.0, self.concentration, shape)) + self.mean

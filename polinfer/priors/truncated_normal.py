@@ -49,17 +49,18 @@ class TruncatedNormal(Prior):
             raise ValueError(f"low must be < high, got low {self.low:g} and high {self.high:g}; swap them.")
 
     @cached_property
-    def _log_normaliser(self) -> float:
+    def log_peak(self) -> float:
+        """Log density at the mean; where that lies outside the bounds, what it would be there."""
         a, b = (self.low - self.mean) / self.scale, (self.high - self.mean) / self.scale
         if a > 0:  # the lower tail keeps its digits far from the mean
             a, b = -b, -a
         log_mass = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
-        return float(log_mass) + log(self.scale) + 0.5 * log(2 * pi)
+        return -float(log_mass) - log(self.scale) - 0.5 * log(2 * pi)
 
     def log_density(self, x: Any) -> jax.Array:
         x = jnp.asarray(x, jnp.result_type(float, x))
         inside = (x >= self.low) & (x <= self.high)
-        return jnp.where(inside, -0.5 * ((x - self.mean) / self.scale) ** 2 - self._log_normaliser, -jnp.inf)
+        return jnp.where(inside, -0.5 * ((x - self.mean) / self.scale) ** 2 + self.log_peak, -jnp.inf)
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         from scipy.stats import truncnorm  # slow to import

@@ -42,7 +42,12 @@ class VonMises(Prior):
     def log_density(self, x: Any) -> jax.Array:
         # cos - 1 with the scaled Bessel function: no cancellation of large numbers at high concentration
         shifted = -2 * jnp.sin(0.5 * (jnp.asarray(x) - self.mean)) ** 2
-        return self.concentration * shifted - log(2 * pi) - log(i0e(self.concentration))
+        return self.concentration * shifted + self.log_peak
+
+    @property
+    def log_peak(self) -> float:
+        """Log density at the mean."""
+        return -log(2 * pi) - log(i0e(self.concentration))
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         angle = np.asarray(rng.vonmises(0.0, self.concentration, shape)) + self.mean

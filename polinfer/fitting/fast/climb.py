@@ -19,8 +19,8 @@ from .point import Point, matrix, polariser_vector, retarder_vector, rotate, uni
 from .priors import COPIES, Term, log_prior
 from .scene import Scene
 
-__all__ = ["Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "lowest_pivot", "moved",
-           "precise_enough"]  # fmt: skip
+__all__ = ["Place", "Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "lowest_pivot",
+           "moved", "precise_enough", "with_prior"]  # fmt: skip
 
 LONGEST_STEP = 0.7  # radians of any angle y
 LEAST_CURVATURE = 1e-6  # of a direction of which neither data nor prior say anything
@@ -28,11 +28,10 @@ ROOT_HALF = 0.5**0.5
 
 
 class Posterior(NamedTuple):
-    """Log posterior at a point with its derivatives by the free angles, and what the residual is there."""
+    """Derivatives by the free angles at a point, of the log posterior or of a part of it."""
 
     gradient: dict[int, Any]
     hessian: dict[tuple[int, int], Any]
-    residual: Residual
 
 
 def evaluate(scene: Scene, data: Data, point: Point) -> tuple[Any, Residual]:
@@ -69,7 +68,7 @@ def derivatives(scene: Scene, balanced: bool, data: Data, point: Point, at: Resi
             outer += [(slopes.rm, first.gradient, second.gradient), (slopes.rm, second.gradient, first.gradient)]
     for weight, left, right in outer:
         hessian = {(i, j): h + weight * left[i] * right[j] for (i, j), h in hessian.items()}
-    return Posterior(gradient, hessian, at)
+    return Posterior(gradient, hessian)
 
 
 def with_prior(prior: tuple[Term | None, ...], point: Point, likelihood: Posterior) -> Posterior:
@@ -80,13 +79,7 @@ def with_prior(prior: tuple[Term | None, ...], point: Point, likelihood: Posteri
         if found is not None:
             gradient[i] = gradient[i] + found[1]
             hessian[i, i] = hessian[i, i] + found[2]
-    return Posterior(gradient, hessian, likelihood.residual)
-
-
-def kept(one: Any, posterior: Posterior) -> Posterior:
-    """The same, behind a division by 1: XLA would compute each entry anew for each of its uses."""
-    gradient, hessian = jax.tree.map(lambda x: x / one, (posterior.gradient, posterior.hessian))
-    return Posterior(gradient, hessian, posterior.residual)
+    return Posterior(gradient, hessian)
 
 
 def frozen(scene: Scene, point: Point, gradient: dict[int, Any]) -> dict[int, Any]:
@@ -109,7 +102,7 @@ def held(posterior: Posterior, stuck: dict[int, Any]) -> Posterior:
         for key in hessian:
             if i in key:
                 hessian[key] = jnp.where(where, -1.0 if key == (i, i) else 0.0, hessian[key])
-    return Posterior(gradient, hessian, posterior.residual)
+    return Posterior(gradient, hessian)
 
 
 def precise_enough(data: Data) -> Any:
@@ -164,13 +157,31 @@ def better_copy(scene: Scene, point: Point) -> Point:
     return best
 
 
+class Place(NamedTuple):
+    """A point, the residual there, and the log posterior."""
+
+    point: Point
+    residual: Residual
+    value: Any
+
+
+def point_of(scene: Scene, rows: Any) -> Point:
+    """The point with the cosine and sine of every free angle ``(2 free, pixels)``."""
+    free = {i: (rows[2 * m], rows[2 * m + 1]) for m, i in enumerate(scene.free)}
+    return Point(*(free[i] if known is None else known for i, known in enumerate(scene.fixed)))
+
+
 def climb(
-    scene: Scene, balanced: bool, data: Data, point: Point, iterations: Any, exchange: Any = True, patience: Any = 0
-) -> Point:
-    """At most ``iterations`` damped Newton steps uphill; the best point that they reach.
+    scene: Scene, balanced: bool, data: Data, start: Any, iterations: Any, exchange: Any = True, patience: Any = 0
+) -> tuple[Place, Posterior]:
+    """At most ``iterations`` damped Newton steps uphill; the best place that they reach, and the derivatives there.
+
+    ``start`` are the cosine and sine of every free angle in turn, ``(2 free, pixels)``.
 
     A step that lowers the density is taken back, unless one of the next ``patience`` comes out higher. With
     ``exchange`` a point gives way to an equivalent one with a higher prior on the way.
+
+    The code of a step is all there is: the first one, with a slope of 0, only looks at the start.
     """
 
     def higher(point: Point) -> Point:
@@ -180,50 +191,65 @@ def climb(
 
     eps = jnp.finfo(data.strength.dtype).eps
     enough, lowest = precise_enough(data), lowest_pivot(data)
-    free = scene.free
+    free, n, shape = scene.free, len(scene.free), data.strength.shape
+
+    def look(point: Point) -> Place:
+        value, at = evaluate(scene, data, point)
+        return Place(point, at, value / data.one)
+
+    structure = jax.tree.structure(jax.eval_shape(look, point_of(scene, start)))
+
+    def packed(place: Place) -> Any:
+        # one array: the compiler makes one piece of code of a choice between two of them, not one for each component
+        return jnp.stack([jnp.broadcast_to(x, shape) for x in jax.tree.leaves(place)])
+
+    def unpacked(rows: Any) -> Place:
+        return jax.tree.unflatten(structure, list(rows))
 
     def advance(carry: Any) -> Any:
-        count, point, best, value, damping, age, done = carry
-        _, at = evaluate(scene, data, point)
-        slope = with_prior(scene.prior, point, derivatives(scene, balanced, data, point, at))
-        slope = held(slope, frozen(scene, point, slope.gradient))
-        slope = kept(data.one, slope)
-        a = {
-            (m, n): -slope.hessian[i, j]
-            + (damping * (jnp.abs(slope.hessian[i, i]) + LEAST_CURVATURE) if i == j else 0.0)
-            for m, i in enumerate(free)
-            for n, j in enumerate(free)
-            if m <= n
-        }
-        lower, smallest = factorise(a, len(free), LEAST_CURVATURE)
-        step, decrement = solve(lower, [slope.gradient[i] for i in free])
+        count, here, best, damping, age, done, gradient, hessian = carry
+        first = count == 0
+        (point, _, _), (_, at, value) = unpacked(here), unpacked(best)
+        slope = held(Posterior(gradient, hessian), frozen(scene, point, gradient))
+        a = {(m, k): -slope.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
+        for m in range(n):
+            a[m, m] = a[m, m] + damping * (jnp.abs(a[m, m]) + LEAST_CURVATURE)
+        found = factorise(a, n, LEAST_CURVATURE)
+        step, decrement = solve(found.lower, [slope.gradient[i] for i in free])
         decrement = decrement / data.one
-        arrived = (decrement < enough) & (smallest > lowest) & (damping == 0) & (age == 0)
+        arrived = (decrement < enough) & (found.smallest > lowest) & (damping == 0) & (age == 0) & ~first
+        turned_by = jnp.clip(jnp.stack(step), -LONGEST_STEP, LONGEST_STEP)
+        cosines, sines = rotate((here[: 2 * n : 2], here[1 : 2 * n : 2]), turned_by)
         pairs = list(point)
-        for i, x in zip(free, step, strict=True):
-            pairs[i] = rotate(point[i], jnp.clip(x, -LONGEST_STEP, LONGEST_STEP))
-        trial = higher(_project(scene, Point(*pairs)))
-        new = evaluate(scene, data, trial)[0] / data.one
-        accept = (new >= value - rounding) & ~done
+        for m, i in enumerate(free):
+            pairs[i] = (cosines[m], sines[m])
+        trial = look(higher(_project(scene, Point(*pairs))))
+        # the residual is rounded like eps times the signal-to-noise ratio, and is squared
+        rounding = 10 * eps * (1 + data.strength) * jnp.sqrt(1 + at.square)
+        accept = (first | (trial.value >= value - rounding)) & ~done
         # along a narrow curved valley of misfit the way leads over its side, if the next steps come out higher
-        astray = ~accept & jnp.isfinite(new) & (age < patience)
+        astray = ~accept & jnp.isfinite(trial.value) & (age < patience) & (count < iterations)
         failed = ~accept & ~astray
         damping = jnp.where(accept, 0.1 * damping, jnp.where(failed, jnp.maximum(10 * damping, 1e-2), damping))
         damping = jnp.where(damping < 1e-3, 0.0, damping)
-        best = jax.tree.map(partial(jnp.where, accept), trial, best)
-        point = jax.tree.map(lambda t, b: jnp.where(astray & ~done, t, b), trial, best)
         # the last step is taken, too: it is paid for, and leaves far less to gain than was asked for
-        done = done | arrived | ~jnp.isfinite(value)
-        return count + 1, point, best, jnp.where(accept, new, value), damping, jnp.where(astray, age + 1, 0), done
+        done = done | arrived | (first & ~jnp.isfinite(trial.value))
+        there = packed(trial)
+        best = jnp.where(accept, there, best)
+        here = jnp.where(astray & ~done, there, best)
+        now = unpacked(here)
+        gradient, hessian = with_prior(
+            scene.prior, now.point, derivatives(scene, balanced, data, now.point, now.residual)
+        )
+        return count + 1, here, best, damping, jnp.where(astray, age + 1, 0), done, gradient, hessian
 
     def unfinished(carry: Any) -> Any:
-        return (carry[0] < iterations) & ~jnp.all(carry[-1])
+        return (carry[0] <= iterations) & ~jnp.all(carry[5])
 
-    point = higher(point)
-    value, at = evaluate(scene, data, point)
-    # the residual is rounded like eps times the signal-to-noise ratio, and is squared
-    rounding = 10 * eps * (1 + data.strength) * jnp.sqrt(1 + at.square) / data.one
-    zero = jnp.zeros_like(value)
-    none = jnp.zeros(value.shape, bool)
-    carry = (jnp.zeros((), jnp.int32), point, point, value, zero, none.astype(jnp.int32), none)
-    return jax.lax.while_loop(unfinished, advance, carry)[2]
+    zero = jnp.zeros_like(data.strength)
+    none = jnp.zeros(shape, bool)
+    begin = jnp.concatenate([start, jnp.broadcast_to(zero, (structure.num_leaves - 2 * n, *shape))])
+    flat = dict.fromkeys(free, zero), {(i, j): zero - (i == j) for i in free for j in free if i <= j}
+    carry = (jnp.zeros((), jnp.int32), begin, begin, zero, none.astype(jnp.int32), none, *flat)
+    _, _, best, _, _, _, gradient, hessian = jax.lax.while_loop(unfinished, advance, carry)
+    return unpacked(best), Posterior(gradient, hessian)

@@ -12,18 +12,9 @@ import jax.numpy as jnp
 from ...degeneracy import REFERENCE
 from ...records import PERIODS, Parameters
 from ..local_gaussian import uniform_std
-from .climb import (
-    LEAST_CURVATURE,
-    derivatives,
-    evaluate,
-    frozen,
-    held,
-    kept,
-    lowest_pivot,
-    precise_enough,
-    with_prior,
-)  # fmt: skip
+from .climb import LEAST_CURVATURE, Place, Posterior, frozen, held, lowest_pivot, precise_enough
 from .data import Data
+from .known import ZERO
 from .linear import Triangle, factorise, inverse, solve
 from .point import Point, sine_of_double
 from .priors import COPIES, FACTORS, log_prior
@@ -77,10 +68,11 @@ def _choose(scene: Scene, one: Any, point: Point, values: Parameters) -> tuple[P
                 candidates.append(_candidate(scene, indices, copy, point, values))
         chosen = _best(candidates, values) / one
         for m, i in enumerate(indices):
-            value, sign = candidates[0].values[m], jnp.full_like(chosen, moves[0][m][0])
+            value, sign = candidates[0].values[m], moves[0][m][0]
+            alike = all(move[m][0] == sign for move in moves)
             for k in range(1, len(moves)):
                 value = jnp.where(chosen == k, candidates[k].values[m], value)
-                sign = jnp.where(chosen == k, moves[k][m][0], sign)
+                sign = sign if alike else jnp.where(chosen == k, moves[k][m][0], sign)
             out[Parameters._fields[i]], signs[i] = value, sign
     return Parameters(**out), signs
 
@@ -132,33 +124,37 @@ def _best(candidates: list[_Candidate], values: Parameters) -> Any:
     return number
 
 
-def _values(scene: Scene, point: Point) -> Parameters:
-    found = [sine_of_double(point.diattenuation)]
-    for name, (c, s) in zip(Parameters._fields[1:], point[1:], strict=True):
-        found.append(jnp.arctan2(s, c) / getattr(FACTORS, name))
-    return Parameters(*(x if v is None else jnp.full_like(x, v) for x, v in zip(found, scene.values, strict=True)))
+def _values(scene: Scene, one: Any, point: Point) -> Parameters:
+    found = []
+    for i, (pair, value) in enumerate(zip(point, scene.values, strict=True)):
+        if value is not None:
+            found.append(jnp.full_like(one, value))
+        else:
+            found.append(jnp.arctan2(pair[1], pair[0]) / FACTORS[i] if i else sine_of_double(pair))
+    return Parameters(*found)
 
 
-def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[Any, Any]:
-    """The rows of the result and the flags of every pixel at a point.
+def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[Any, Any]:
+    """The rows of the result and the flags of every pixel at a place with the derivatives of the log posterior there.
 
     The covariance is that of the parameters. Where the maximum lies on a bound (``FROZEN``) the rows of that parameter
     hold instead how the others follow the bounded angle y, and the inverse curvature along y; then the evidence leaves
     that angle out. ``ROUGH`` marks a maximum that rounding may have missed by more than the precision promises.
     """
-    if not scene.bounded:  # the other sign of J, which a free phase takes up
+    point, at, value = place
+    gain = scene.likelihood.mean_gain(at)
+    if 2 in scene.free and not scene.bounded:  # the other sign of J, which a free phase takes up
         c, s = point.retardance
         down = c < 0
         point = point._replace(retardance=(jnp.where(down, -c, c), jnp.where(down, -s, s)))
-    value, at = evaluate(scene, data, point)
-    likelihood = kept(data.one, derivatives(scene, balanced, data, point, at))
-    whole = with_prior(scene.prior, point, likelihood)
+        gain = None if gain is None else tuple(jnp.where(down, -x, x) for x in gain)
     stuck = frozen(scene, point, whole.gradient)
     local = held(whole, stuck)
     free, n = scene.free, len(scene.free)
     at_index = {i: m for m, i in enumerate(free)}
     a = {(m, k): -local.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
-    lower, smallest = factorise(a, n, LEAST_CURVATURE)
+    factor = factorise(a, n, LEAST_CURVATURE)
+    lower, smallest = factor.lower, factor.smallest
     _, decrement = solve(lower, [local.gradient[i] for i in free])
     c = {key: x / data.one for key, x in inverse(lower, n).items()}
     c |= {(k, m): x for (m, k), x in c.items()}
@@ -183,14 +179,16 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
     total, doubtful = jnp.full_like(value, log(scene.groups[0][1])), jnp.zeros(value.shape, bool)
     own = log_prior(scene.prior, point)
     for prior, count in scene.groups[1:]:
-        other = held(with_prior(prior, point, likelihood), stuck)
-        b = dict(a)
-        change = []
-        for i in free:
-            delta = jnp.zeros_like(value) if prior[i] == scene.prior[i] else other.gradient[i] - local.gradient[i]
-            change.append(delta)
-            b[at_index[i], at_index[i]] = -other.hessian[i, i]
-        low, least = factorise(b, n)
+        change, b = [ZERO] * n, dict(a)
+        differ = [i for i in free if prior[i] != scene.prior[i]]
+        for i in differ:
+            slope, bend = _difference(prior[i], scene.prior[i], point[i])
+            m = at_index[i]
+            change[m], b[m, m] = slope, b[m, m] - bend
+            if i in stuck:
+                change[m], b[m, m] = jnp.where(stuck[i], 0, slope), jnp.where(stuck[i], 1, b[m, m])
+        its = factorise(b, n, begun=factor, first=at_index[differ[0]])
+        low, least = its.lower, its.smallest
         lift = 0.5 * solve(low, change)[1]
         gap = log_prior(prior, point) - own
         # one that could climb above this one is to be tried
@@ -216,7 +214,7 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
             c[m, k] = c[k, m] = jnp.where(where, follow[k], c[k, m])
         c[m, m] = jnp.where(where, 1 / curvature, c[m, m])
 
-    values = _values(scene, point)
+    values = _values(scene, jnp.ones_like(value), point)
     if 0 in stuck:  # on the bound, not an ulp off it: the density falls by a square root from there
         values = values._replace(
             diattenuation=jnp.where(stuck[0], jnp.sign(values.diattenuation), values.diattenuation)
@@ -228,21 +226,19 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
     if 2 in stuck:
         widths[2] = jnp.where(stuck[2], 1.0, widths[2])
     zero = jnp.zeros_like(value)
-    covariance = []
-    for i in range(5):
-        for j in range(5):
-            if i in at_index and j in at_index:
-                scale = widths[i] * widths[j]
-                covariance.append(signs[i] * signs[j] * scale * c[at_index[i], at_index[j]])
-            else:
-                covariance.append(zero)
-    std = [jnp.sqrt(covariance[6 * i]) for i in range(5)]
+    scale = jnp.stack([jnp.broadcast_to(signs[i] * widths[i], zero.shape) if i in free else zero for i in range(5)])
+    each = [c[at_index[i], at_index[j]] if i in free and j in free else zero for i in range(5) for j in range(5)]
+    covariance = scale[:, None] * scale * jnp.stack(each).reshape(5, 5, -1)
+    std = jnp.abs(scale) * jnp.sqrt(jnp.stack(each[::6]))
     slopes = [jnp.where(stuck[i], jnp.abs(whole.gradient[i]), 0) if i in stuck else zero for i in (0, 2)]
-    found = [*parameters, *std, *covariance, value, evidence, 2 * (at.square + data.residual), *slopes]
-    gain = scene.likelihood.mean_gain(at)
-    if gain is not None:
-        found += list(gain)
-    return jnp.stack([jnp.broadcast_to(x, value.shape) for x in found]), flags
+    rest = [value, evidence, 2 * (at.square + data.residual), *slopes, *(() if gain is None else gain)]
+    return jnp.concatenate([jnp.stack(parameters), std, covariance.reshape(25, -1), jnp.stack(rest)]), flags
+
+
+def _difference(left: Any, right: Any, pair: Any) -> tuple[Any, Any]:
+    """How the first and the second derivatives of two terms of the prior differ."""
+    (_, *one), (_, *two) = left.evaluate(pair), right.evaluate(pair)
+    return one[0] - two[0], one[1] - two[1]
 
 
 def _key(i: int, j: int) -> tuple[int, int]:

@@ -25,8 +25,12 @@ from .scene import Scene
 
 __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
 
-BLOCKS = (1024, 4096)  # numbers of pixels for which code is compiled
-FIRST, MOST, LAST = 3, 60, 500  # Newton steps of the first pass, of the others, and of the last
+# pixels for which code is compiled: in small frames, which all cores shall share, and in large ones
+BLOCKS = (512, 4096)
+# Newton steps of the first pass; of the others at first, and for pixels that need more; and of the last
+FIRST, SOME, MOST, LAST = 3, 10, 60, 500
+ALONE = 2048  # pixels up to which threads cost more than they bring
+LOOKS = 1 << 16  # climbs from other starts that are in memory at once
 POLARISER = 0.9  # |D| from which on a free phase leaves the angle of the retarder about the same axis open
 TURNS = [k * pi / 6 for k in range(1, 6)]  # about that axis; pi changes the sign of J
 
@@ -116,7 +120,7 @@ def _pass(
 ) -> None:  # fmt: skip
     """Rows and flags of the pixels ``index`` (None: all), from a start or the closed form, into ``out``."""
     count = frame.pixels if index is None else len(index)
-    size = BLOCKS[0] if frame.pixels <= BLOCKS[0] or count <= BLOCKS[0] // 2 else BLOCKS[1]
+    size = BLOCKS[frame.pixels > BLOCKS[1]]  # one for all passes: to compile takes seconds
     nothing = kernel.no_start(size, frame.dtype)
 
     def work(begin: int) -> None:
@@ -135,7 +139,12 @@ def _pass(
         flags[begin:end] = np.asarray(bits)[: end - begin]
         done(end - begin)
 
-    each(work, range(0, count, size))
+    begins = range(0, count, size)
+    if count > ALONE:
+        each(work, begins)
+    else:
+        for begin in begins:
+            work(begin)
 
 
 def _alternatives(points: np.ndarray) -> list[np.ndarray]:
@@ -164,6 +173,9 @@ def _alternatives(points: np.ndarray) -> list[np.ndarray]:
         changed(retardance=(0.05, -edge)),
         changed(diattenuation=(0.85, 0.527)),
     ]
+
+
+STARTS = 8  # that many at most
 
 
 def _copies(scene: Scene, points: np.ndarray) -> list[np.ndarray]:
@@ -228,16 +240,40 @@ def _again(
     starts: Callable[[np.ndarray, np.ndarray], list[np.ndarray]], given: int = kernel.GIVEN, iterations: int = MOST,
 ) -> None:  # fmt: skip
     """Climb again from other starts, and keep what is better."""
-    index = np.flatnonzero(which)
-    if len(index) == 0:
-        return
-    new, bits = np.empty((len(out), len(index)), out.dtype), np.empty(len(index), np.int32)
-    points = pairs_of(Parameters(*out[ROWS["parameters"]][:, index]), frame.dtype)
-    for begun in starts(points, index):
-        _pass(scene, frame, index, begun, given, iterations, new, bits, lambda _: None)
-        value, old = new[ROWS["log_posterior"]], out[ROWS["log_posterior"], index]
-        # what is better by rounding only is worth no change, unless it settles a pixel
-        slack, rounding = (1e-9, 1e-6) if out.dtype == np.float64 else (1e-4, 0.05)
-        settled = (bits & CONVERGED) > (flags[index] & CONVERGED)
-        better = (bits & NON_FINITE == 0) & ((value > old + slack) | ((value > old - rounding) & settled))
-        out[:, index[better]], flags[index[better]] = new[:, better], bits[better]
+    pixels = np.flatnonzero(which)
+    step = LOOKS // STARTS
+    for begin in range(0, len(pixels), step):
+        index = pixels[begin : begin + step]
+        begun = starts(pairs_of(Parameters(*out[ROWS["parameters"]][:, index]), frame.dtype), index)
+        # all starts of all pixels side by side: a block is full, and waits for its slowest climb once
+        new, bits = _climb(scene, frame, np.tile(index, len(begun)), np.concatenate(begun, axis=1), given, iterations)
+        for found, its in zip(np.split(new, len(begun), axis=1), np.split(bits, len(begun)), strict=True):
+            value, old = found[ROWS["log_posterior"]], out[ROWS["log_posterior"], index]
+            # what is better by rounding only is worth no change, unless it settles a pixel
+            slack, rounding = (1e-9, 1e-6) if out.dtype == np.float64 else (1e-4, 0.05)
+            settled = (its & CONVERGED) > (flags[index] & CONVERGED)
+            better = (its & NON_FINITE == 0) & ((value > old + slack) | ((value > old - rounding) & settled))
+            out[:, index[better]], flags[index[better]] = found[:, better], its[better]
+
+
+def _climb(
+    scene: Scene, frame: Frame, index: np.ndarray, start: np.ndarray, given: int, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and flags of the pixels ``index`` from a start each."""
+    new, bits = np.empty((rows(scene), len(index)), frame.dtype), np.empty(len(index), np.int32)
+
+    def go(which: np.ndarray, start: np.ndarray, steps: int) -> None:
+        found, its = np.empty((len(new), len(which)), new.dtype), np.empty(len(which), bits.dtype)
+        _pass(scene, frame, index[which], start, given, steps, found, its, lambda _: None)
+        new[:, which], bits[which] = found, its
+
+    everything = np.arange(len(index))
+    if given != kernel.GIVEN:
+        go(everything, start, iterations)
+        return new, bits
+    go(everything, start, SOME)
+    # a block takes as many steps as its slowest pixel: gather those that need more
+    slow = np.flatnonzero((bits & (CONVERGED | NON_FINITE)) == 0)
+    if len(slow):
+        go(slow, pairs_of(Parameters(*new[ROWS["parameters"]][:, slow]), frame.dtype), iterations)
+    return new, bits

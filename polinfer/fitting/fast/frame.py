@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -139,6 +140,7 @@ def status_of(model: Model, solved: Solved) -> np.ndarray:
     return status
 
 
+@lru_cache(maxsize=256)
 def fast_scene(model: Model) -> Scene | None:
     """The scene of a model whose statistics are those of single pixels, sigma given; None if it has no fast form."""
     if model.noise.integrated or (model.neighbours is not None and model.gain is not None):

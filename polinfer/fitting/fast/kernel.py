@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from math import pi
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ...statistics import Statistics
 from .climb import climb
 from .data import Data, Matrix, prepare
 from .describe import describe
-from .point import Point
 from .scene import Scene
 from .start import closed_form
 
@@ -35,9 +35,10 @@ class Shared(NamedTuple):
     count: Any
 
 
+@cache
 def no_start(pixels: int, dtype: Any) -> jax.Array:
     """Stands for a start where there is none."""
-    return jnp.zeros((10, pixels), dtype)
+    return jax.device_put(np.zeros((10, pixels), dtype))
 
 
 def _parts(a: Any) -> Matrix:
@@ -47,12 +48,10 @@ def _parts(a: Any) -> Matrix:
 def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, iterations: Any) -> tuple[Any, Any]:
     closed = closed_form(scene, data)
     # a start may come from another model: what is fixed stays
-    told = Point(
-        *((start[2 * i], start[2 * i + 1]) if known is None else closed[i] for i, known in enumerate(scene.fixed))
-    )
-    point = jax.tree.map(partial(jnp.where, given != CLOSED_FORM), told, closed)
+    told = start if len(scene.free) == 5 else jnp.stack([start[2 * i + k] for i in scene.free for k in (0, 1)])
+    begun = jnp.where(given != CLOSED_FORM, told, jnp.stack(jax.tree.leaves(closed)))
     patience = jnp.where(given == PATIENT, PATIENCE, 0)
-    return describe(scene, balanced, data, climb(scene, balanced, data, point, iterations, given != STAY, patience))
+    return describe(scene, data, *climb(scene, balanced, data, begun, iterations, given != STAY, patience))
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -15,6 +15,7 @@ from ...circular import bessel_ratio, log_scaled_bessel
 from ...gain import ComplexGain, PhaseGain
 from ...model import Model
 from ...noise import KnownNoise
+from .known import ZERO, Known
 from .point import Pair, unit
 
 __all__ = ["Complex", "Likelihood", "Phase", "Residual", "Slopes", "Unit", "likelihood"]
@@ -72,7 +73,7 @@ class Unit:
 
     def residual(self, model: list[list[Pair]], data: list[list[Pair]]) -> Residual:
         """What the other methods need of a matrix."""
-        return Residual((1.0, 0.0), square(model, data, None), None, (None, None))
+        return Residual((Known(1.0), ZERO), square(model, data, None), None, (ZERO, ZERO))
 
     def value(self, at: Residual) -> Any:
         """Log likelihood without the statistics' constant."""

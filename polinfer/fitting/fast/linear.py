@@ -6,30 +6,44 @@ would grow exponentially; it keeps the result of a division.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import reduce
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-__all__ = ["Triangle", "factorise", "inverse", "solve"]
+__all__ = ["Factor", "Triangle", "factorise", "inverse", "solve"]
 
 Triangle = dict[tuple[int, int], Any]
 
 
-def factorise(a: Triangle, n: int, floor: float | None = None) -> tuple[Triangle, Any]:
-    """``a = L L^T`` from the upper triangle of ``a``: the lower triangle L, and the smallest pivot.
+class Factor(NamedTuple):
+    """The lower triangle L, and the pivots."""
 
-    With a ``floor`` pivots are made positive and at least that large, so that a solution is a way uphill.
+    lower: Triangle
+    pivots: list[Any]
+
+    @property
+    def smallest(self) -> Any:
+        """The smallest pivot."""
+        return reduce(jnp.minimum, self.pivots)
+
+
+def factorise(a: Triangle, n: int, floor: float | None = None, begun: Factor | None = None, first: int = 0) -> Factor:
+    """``a = L L^T`` from the upper triangle of ``a``.
+
+    With a ``floor`` pivots are made positive and at least that large, so that a solution is a way uphill. ``begun`` is
+    the factor of a matrix that differs from ``a`` from the column ``first`` on only.
     """
-    lower: Triangle = {}
-    smallest: Any = None
-    for j in range(n):
+    lower: Triangle = {} if begun is None else {(i, j): x for (i, j), x in begun.lower.items() if j < first}
+    pivots = [] if begun is None else begun.pivots[:first]
+    for j in range(first, n):
         pivot = a[j, j] - sum((lower[j, k] * lower[j, k] for k in range(j)), start=0.0)
-        smallest = pivot if smallest is None else jnp.minimum(smallest, pivot)
+        pivots.append(pivot)
         lower[j, j] = jnp.sqrt(pivot if floor is None else jnp.maximum(jnp.abs(pivot), floor))
         for i in range(j + 1, n):
             rest = a[j, i] - sum((lower[i, k] * lower[j, k] for k in range(j)), start=0.0)
             lower[i, j] = rest / lower[j, j]
-    return lower, smallest
+    return Factor(lower, pivots)
 
 
 def solve(lower: Triangle, b: list[Any]) -> tuple[list[Any], Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from .known import ZERO
 from .point import Pair, Point, Vector, dot, polariser_vectors, retarder_vectors
 
 __all__ = ["Derivatives", "Pauli", "coefficients", "energy", "imaginary", "overlap", "overlap_slopes", "pauli",
@@ -95,8 +96,8 @@ def overlap_slopes(t: list[Vector], point: Point) -> tuple[Any, list[Any]]:
 def quadratic_forms(s: Pauli) -> tuple[list[Vector], list[Vector]]:
     """Matrices M of the z and x components ``q^T M q`` of the Stokes vector s turned by the retarder."""
     z, x, y = s.z[0], s.x[0], s.y[0]
-    z_matrix = [[z, None, y, -x], [None, z, -x, -y], [y, -x, -z, None], [-x, -y, None, -z]]
-    x_matrix = [[x, y, None, z], [y, -x, -z, None], [None, -z, x, y], [z, None, y, -x]]
+    z_matrix = [[z, ZERO, y, -x], [ZERO, z, -x, -y], [y, -x, -z, ZERO], [-x, -y, ZERO, -z]]
+    x_matrix = [[x, y, ZERO, z], [y, -x, -z, ZERO], [ZERO, -z, x, y], [z, ZERO, y, -x]]
     return z_matrix, x_matrix
 
 
@@ -116,11 +117,10 @@ def energy(retarder_first: bool, s: Pauli, point: Point) -> Derivatives:
     (c, e), (x, y) = point.diattenuation, point.diattenuation_angle
     sine, cosine = 2 * e * c, c * c - e * e  # D and cos delta
     q, dq = retarder_vectors(point)
-    zero = s.z[0] * 0
     if not retarder_first:
         along, across = x * s.z[0] - y * s.x[0], -y * s.z[0] - x * s.x[0]
-        gradient = [2 * cosine * along, sine * across, zero, zero, zero]
-        hessian = dict.fromkeys(FREE_PAIRS, zero)
+        gradient = [2 * cosine * along, sine * across, ZERO, ZERO, ZERO]
+        hessian = dict.fromkeys(FREE_PAIRS, ZERO)
         hessian |= {(0, 0): -4 * sine * along, (0, 1): 2 * cosine * across, (1, 1): -sine * along}
         return Derivatives(s.one[0] + sine * along, gradient, hessian)
     z, w, z_matrix, x_matrix = _turn(s, q)
@@ -143,11 +143,4 @@ def energy(retarder_first: bool, s: Pauli, point: Point) -> Derivatives:
 
 
 def _combine(a: Any, left: list[Vector], b: Any, right: list[Vector]) -> list[Vector]:
-    def element(p: Any, q: Any) -> Any:
-        if p is None and q is None:
-            return None
-        if p is None:
-            return b * q
-        return a * p if q is None else a * p + b * q
-
-    return [[element(p, q) for p, q in zip(r, s, strict=True)] for r, s in zip(left, right, strict=True)]
+    return [[a * p + b * q for p, q in zip(r, s, strict=True)] for r, s in zip(left, right, strict=True)]

@@ -7,7 +7,7 @@ The angles are ``y = (delta/2, 2 theta_D, eta/2, 2 theta_eta, xi)`` with ``D = s
 ``q = (cos y2, sin y2 cos y3, sin y2 sin y3 cos y4, sin y2 sin y3 sin y4)``
 
 the elements are ``A_pol = u0 + u1 Z - u2 X`` and ``A_ret = q0 + i (q1 Z - q2 X - q3 Y)`` in the Pauli matrices. All
-functions are element-wise: a component is an array of pixels, and None stands for a component that is always 0.
+functions are element-wise: a component is an array of pixels, or a number that is :class:`Known` while tracing.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from .known import ZERO
 
 __all__ = ["Pair", "Point", "dot", "matrix", "polariser_vector", "polariser_vectors", "retarder_vector",
            "retarder_vectors", "rotate", "sine_of_double", "unit"]  # fmt: skip
@@ -35,9 +37,8 @@ class Point(NamedTuple):
 
 
 def dot(left: Vector, right: Vector) -> Any:
-    """Scalar product; components that are None are 0."""
-    terms = [a * b for a, b in zip(left, right, strict=True) if a is not None and b is not None]
-    return sum(terms[1:], start=terms[0])
+    """Scalar product."""
+    return sum((a * b for a, b in zip(left, right, strict=True)), start=ZERO)
 
 
 def unit(x: Any, y: Any) -> Pair:
@@ -90,9 +91,9 @@ def polariser_vectors(point: Point) -> tuple[Vector, dict[tuple[int, ...], Vecto
     sx, sy, cx, cy = s * x, s * y, c * x, c * y
     return [c, sx, sy], {
         (0,): [-s, cx, cy],
-        (1,): [None, -sy, sx],
-        (0, 1): [None, -cy, cx],
-        (1, 1): [None, -sx, -sy],
+        (1,): [ZERO, -sy, sx],
+        (0, 1): [ZERO, -cy, cx],
+        (1, 1): [ZERO, -sx, -sy],
     }
 
 
@@ -102,13 +103,13 @@ def retarder_vectors(point: Point) -> tuple[Vector, dict[tuple[int, ...], Vector
     sx, sy, cx, cy = s * x, s * y, c * x, c * y
     return [c, sx, sy * a, sy * b], {
         (2,): [-s, cx, cy * a, cy * b],
-        (3,): [None, -sy, sx * a, sx * b],
-        (4,): [None, None, -sy * b, sy * a],
-        (2, 3): [None, -cy, cx * a, cx * b],
-        (2, 4): [None, None, -cy * b, cy * a],
-        (3, 3): [None, -sx, -sy * a, -sy * b],
-        (3, 4): [None, None, -sx * b, sx * a],
-        (4, 4): [None, None, -sy * a, -sy * b],
+        (3,): [ZERO, -sy, sx * a, sx * b],
+        (4,): [ZERO, ZERO, -sy * b, sy * a],
+        (2, 3): [ZERO, -cy, cx * a, cx * b],
+        (2, 4): [ZERO, ZERO, -cy * b, cy * a],
+        (3, 3): [ZERO, -sx, -sy * a, -sy * b],
+        (3, 4): [ZERO, ZERO, -sx * b, sx * a],
+        (4, 4): [ZERO, ZERO, -sy * a, -sy * b],
     }
 
 

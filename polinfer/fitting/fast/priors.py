@@ -101,8 +101,7 @@ def term(name: str, prior: Any) -> Term | None:
     low, high = getattr(RANGES, name)
     if name == "diattenuation":
         if type(prior) is TruncatedNormal and (prior.low, prior.high) == (low, high):
-            return Normal(float(prior.log_density(prior.mean)) if low <= prior.mean <= high else
-                          _peak(prior), prior.mean, prior.scale)  # fmt: skip
+            return Normal(prior.log_peak, prior.mean, prior.scale)
         if type(prior) is UniformAngle and isclose(prior.period, high - low):
             return Flat(-log(prior.period))
         return None
@@ -115,14 +114,9 @@ def term(name: str, prior: Any) -> Term | None:
     order = own / factor
     if order not in (1, 2, 4):
         return None
-    peak = float(prior.log_density(prior.mean)) - prior.concentration
-    return Harmonic(peak, int(order), own * prior.mean, prior.concentration).transformed(1, 0.0)
-
-
-def _peak(prior: TruncatedNormal) -> float:
-    """What the log density would be at a mean outside the bounds."""
-    middle = 0.5 * (prior.low + prior.high)
-    return float(prior.log_density(middle)) + 0.5 * ((middle - prior.mean) / prior.scale) ** 2
+    return Harmonic(
+        prior.log_peak - prior.concentration, int(order), own * prior.mean, prior.concentration
+    ).transformed(1, 0.0)
 
 
 def terms(model: Model) -> tuple[Term | None, ...] | None:

@@ -10,6 +10,7 @@ from ...model import Model
 from ...orderings import PolariserFirst, RetarderFirst
 from ...records import Parameters
 from ..local_gaussian import distinct_copies
+from .known import Known
 from .likelihoods import Likelihood, likelihood
 from .priors import FACTORS, Term, copies, terms
 
@@ -22,10 +23,10 @@ BOUNDS = {"diattenuation": (-1.0, 1.0), "retardance": (-pi, pi)}
 class Scene:
     """A model in the form in which the fast route evaluates it.
 
-    ``free`` are the angles that move; ``fixed`` the (cosine, sine) of the others; ``values`` the fixed values to
-    report (0 for parameters that drop out). ``copies`` are which of the eight equivalent sets the model tells apart,
-    ``groups`` their distinct priors as functions of the point, with the number of copies that share each; the first
-    is that of the point itself. ``bounded`` says that the retardance ends at -pi and pi.
+    ``free`` are the angles that move; ``fixed`` the (cosine, sine) of the others, known while tracing; ``values`` the
+    fixed values to report (0 for parameters that drop out). ``copies`` are which of the eight equivalent sets the model
+    tells apart, ``groups`` their distinct priors as functions of the point, with the number of copies that share each;
+    the first is that of the point itself. ``bounded`` says that the retardance ends at -pi and pi.
     """
 
     model: Model
@@ -34,7 +35,7 @@ class Scene:
     prior: tuple[Term | None, ...]
     constant: float
     free: tuple[int, ...]
-    fixed: tuple[tuple[float, float] | None, ...]
+    fixed: tuple[tuple[Known, Known] | None, ...]
     values: tuple[float | None, ...]
     copies: tuple[bool, ...]
     groups: tuple[tuple[tuple[Term | None, ...], int], ...]
@@ -56,7 +57,7 @@ def scene(model: Model) -> Scene | None:
     counts: dict[tuple[Term | None, ...], int] = {prior: 0}
     for one in copies(prior, rows):
         counts[one] = counts.get(one, 0) + 1
-    fixed: list[tuple[float, float] | None] = []
+    fixed: list[tuple[Known, Known] | None] = []
     values: list[float | None] = []
     for name, factor in zip(Parameters._fields, FACTORS, strict=True):
         if name in model.free:
@@ -65,7 +66,7 @@ def scene(model: Model) -> Scene | None:
             continue
         value = model.fixed.get(name, 0.0)
         angle = 0.5 * asin(value) if name == "diattenuation" else factor * value
-        fixed.append((cos(angle), sin(angle)))
+        fixed.append((Known(cos(angle)), Known(sin(angle))))
         values.append(value)
     return Scene(
         model=model,

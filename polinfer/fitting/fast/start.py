@@ -53,7 +53,7 @@ def closed_form(scene: Scene, data: Data) -> Point:
 
 def _fixed(scene: Scene, index: int, pair: Pair) -> Pair:
     known = scene.fixed[index]
-    return pair if known is None else (jnp.full_like(pair[0], known[0]), jnp.full_like(pair[0], known[1]))
+    return pair if known is None else known
 
 
 def _quaternion(retarder_first: bool, k: Pauli, u: list[Any]) -> list[Any]:
