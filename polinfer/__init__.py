@@ -9,6 +9,7 @@ from .files import load
 from .fitting import fit
 from .gain import ComplexGain, PhaseGain
 from .gauge import smooth_gauge
+from .misalignment import RotatedBasis, TiltPlane
 from .model import Model
 from .neighbours import Window
 from .noise import InferredNoise, KnownNoise
@@ -18,6 +19,7 @@ from .records import Fit, Measurement, Parameters, Status
 from .sampling import Draws, Ensemble, Gibbs, calibration_ranks, sample, summarise
 from .simulation import simulate
 from .storage import save
+from .tilting import untilt
 
 __all__ = [
     "AxialVonMises",
@@ -37,7 +39,9 @@ __all__ = [
     "PolariserFirst",
     "Prior",
     "RetarderFirst",
+    "RotatedBasis",
     "Status",
+    "TiltPlane",
     "TruncatedNormal",
     "UniformAngle",
     "VonMises",
@@ -62,4 +66,5 @@ __all__ = [
     "simulate",
     "smooth_gauge",
     "summarise",
+    "untilt",
 ]

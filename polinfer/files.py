@@ -8,6 +8,7 @@ from typing import Any
 from . import storage
 from .datasets import FibreMatrix
 from .gain import ComplexGain, PhaseGain
+from .misalignment import RotatedBasis, Tilt, TiltPlane
 from .model import Model
 from .neighbours import Window
 from .noise import InferredNoise, KnownNoise
@@ -30,6 +31,7 @@ TYPES: tuple[type, ...] = (
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
     KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,
+    TiltPlane, RotatedBasis, Tilt,
 )  # fmt: skip
 
 
