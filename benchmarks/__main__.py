@@ -10,7 +10,7 @@ import inspect
 import jax
 
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
-ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "posterior", "calibration")
+ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "misalignment", "posterior", "calibration")
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
 from . import conventions, datasets, phantoms
-from .bounds import cramer_rao_bound
+from .bounds import cramer_rao_bound, tilt_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
@@ -66,5 +66,6 @@ __all__ = [
     "simulate",
     "smooth_gauge",
     "summarise",
+    "tilt_bound",
     "untilt",
 ]

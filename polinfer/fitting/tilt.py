@@ -25,7 +25,7 @@ from .local_gaussian import uniform_std
 from .tilt_pixels import Pixels, pixels_of
 from .tilt_start import fold, refine, spectrum_of, wrap_piston
 
-__all__ = ["fit_tilted"]
+__all__ = ["UNIFORM", "fit_tilted", "shares"]
 
 SAMPLE = 8192  # pixels by which the plane is found before all of them are asked
 STEPS, MORE = 12, 4  # Newton steps with the sample, and with all pixels
@@ -129,9 +129,9 @@ def _unidentified(
     """Where no plane stands out the tilt is what it was before the data, 0, and as uncertain as then."""
     coefficients = np.zeros(len(plane.terms))
     covariance = np.diag([UNIFORM**2, *[plane.scale**2] * (len(coefficients) - 1)])
-    follow = np.zeros((5, *pixels.frame))
-    if pixels.count and model.neighbours is None and not model.noise.integrated:
-        follow = pixels.spread(pixels.at_fit(coefficients, best).follow, np.nan)
+    # the circularity is then as uncertain
+    moves = np.array([float(name == "circularity" and name in model.free) for name in Parameters._fields])
+    follow = pixels.spread(np.repeat(moves[:, None], pixels.count, axis=1), np.nan)
     found = _with_tilt(model, best, _tilt(plane, measurement, coefficients, covariance, share, 0.0, follow))
     used = (found.status & int(Status.MASKED | Status.NON_FINITE)) == 0
     return replace(found, status=found.status | np.where(used, np.int32(Status.TILT_UNIDENTIFIED), np.int32(0)))
@@ -276,14 +276,23 @@ def _climb(
     return best
 
 
+def shares(found: Fit) -> np.ndarray:
+    """What every pixel takes over of the log evidence of its frame's tilt: they add up to it."""
+    assert found.tilt is not None
+    answered = (found.status & NO_ANSWER) == 0
+    members = answered.astype(np.int64)
+    if found.model.neighbours is not None:  # one result of a window stands for all of its pixels
+        members = box_sum(members, found.model.neighbours)
+    number = np.sum(answered, axis=tuple(range(-min(2, answered.ndim), 0)), keepdims=True)
+    price = found.tilt.log_evidence.reshape(number.shape)
+    return np.asarray(price * members / np.maximum(number, 1), found.log_evidence.dtype)
+
+
 def _with_tilt(model: Model, found: Fit, tilt: Tilt) -> Fit:
     """The fit of the pixels, with the uncertainty and the price of the tilt."""
     kind = found.covariance.dtype
     answered = (found.status & NO_ANSWER) == 0
-    members = answered.astype(np.int64)
-    if model.neighbours is not None:  # one result of a window stands for all of its pixels
-        members = box_sum(members, model.neighbours)
-    evidence = found.log_evidence + (float(tilt.log_evidence) * members / max(int(answered.sum()), 1)).astype(kind)
+    evidence = found.log_evidence + shares(replace(found, tilt=tilt))
     follow = np.nan_to_num(tilt.response) * tilt.phase_std[..., None]
     total = found.covariance + (follow[..., :, None] * follow[..., None, :]).astype(kind)
     with np.errstate(invalid="ignore"):
