@@ -126,7 +126,9 @@ def _unknown(results: Results) -> None:
     """Half-wave plates along the axes: nothing tells the tilt, and that is the right answer."""
     for angle, retardance in product((0.0, 30.0, 90.0, 180.0), (np.pi, 2.7)):
         truth = Parameters(np.full(SHAPE, 0.03), 0.6, retardance, np.radians(angle), 0.0)
-        data = polinfer.simulate(Model(), truth, scenes.balanced_states(), 0.05, rng=1, tilt=plane(SHAPE, 0.4, 3.0, 6.0))
+        data = polinfer.simulate(
+            Model(), truth, scenes.balanced_states(), 0.05, rng=1, tilt=plane(SHAPE, 0.4, 3.0, 6.0)
+        )
         found = polinfer.fit(TILTED, data)
         assert found.tilt is not None
         error = np.sqrt(np.mean(errors(found.parameters, truth) ** 2, axis=1))

@@ -102,7 +102,7 @@ def _information(model: Model, parameters: Parameters, illumination: Any, sigma:
         by_phase = by_phase + jacobian[..., model.free.index("circularity")]
     by_phase = np.where(np.abs(by_phase) < 100 * eps * np.sqrt(np.sum(every**2, axis=(-1, -2)))[:, None], 0, by_phase)
     along = np.einsum("pdk,pd->pk", left, by_phase) * ~lost
-    follow = -np.einsum("pki,pk->pi", axes, inverse * along) 
+    follow = -np.einsum("pki,pk->pi", axes, inverse * along)
     if "circularity" in model.free:
         follow[:, model.free.index("circularity")] += 1
     rest = by_phase - np.einsum("pdk,pk->pd", left, along)

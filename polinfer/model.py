@@ -155,7 +155,9 @@ class Model:
         known, prior = fixed.get("circularity", 0), _known_names("priors", self.priors).get("circularity")
         if known != 0 or prior is not None:
             given = f"fixed['circularity'] = {known}" if known != 0 else f"priors['circularity'] = {prior}"
-            raise ValueError(f"misalignment is RotatedBasis(), a model without circularity, and {given}; leave that out.")
+            raise ValueError(
+                f"misalignment is RotatedBasis(), a model without circularity, and {given}; leave that out."
+            )
 
     @property
     def dropped(self) -> frozenset[str]:
@@ -261,7 +263,9 @@ class Model:
             phase = tilt_of(tilt, measurement.shape)
             summary = summary._replace(statistics=tilted_statistics(summary.statistics, phase))
         elif isinstance(self.misalignment, TiltPlane):
-            raise ValueError("tilt is None and the model has a TiltPlane; pass the phases, such as tilt=fit.tilt.phase.")
+            raise ValueError(
+                "tilt is None and the model has a TiltPlane; pass the phases, such as tilt=fit.tilt.phase."
+            )
         if self.neighbours is None:
             values = function(self, given, as_device(summary.statistics, dtype))
         else:

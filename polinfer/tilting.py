@@ -49,9 +49,7 @@ def tilted_statistics(statistics: Statistics, phase: np.ndarray) -> Statistics:
         found[..., 1, :] *= turn
         return found
 
-    return statistics._replace(
-        illumination=turned(statistics.illumination), response=turned(statistics.response)
-    )
+    return statistics._replace(illumination=turned(statistics.illumination), response=turned(statistics.response))
 
 
 def untilt(measurement: Measurement, tilt: Any) -> Measurement:
@@ -60,7 +58,7 @@ def untilt(measurement: Measurement, tilt: Any) -> Measurement:
     Of ``V = g T^-1 J T U + noise`` with ``T = diag(1, e^{i phi})`` it is ``T V = g J (T U) + noise'``, where the noise is
     as before, because T is unitary. Where all pixels share balanced states (``U U^H`` proportional to 1) the
     illumination stays what it was: with ``Jhat = V U^H / s_0``, ``V' = T (V + (Jhat T^-1 - Jhat) U)`` has the same
-    residual for every J.
+    residual for every J. (The noise of single states is then mixed: do not leave one out afterwards.)
 
     Parameters
     ----------

@@ -102,7 +102,13 @@ def simulate_command(
     phase = None if tilt is None else TiltPlane().phase(np.radians(tilt), shape)
     # with one seed for both, the noise would repeat the draws of which the scene is made
     data = simulate(
-        Model(named_ordering(ordering)), scene.parameters, illumination, sigma, rng=seed + 1, gain=scene.gain, tilt=phase
+        Model(named_ordering(ordering)),
+        scene.parameters,
+        illumination,
+        sigma,
+        rng=seed + 1,
+        gain=scene.gain,
+        tilt=phase,
     )
     storage.save(data, out, overwrite=overwrite)
     if truth is not None:

@@ -23,17 +23,21 @@ from ..records import Fit, Measurement, Parameters, Status
 from ..tilting import untilt
 from .local_gaussian import uniform_std
 from .tilt_pixels import Pixels, pixels_of
-from .tilt_start import fold, refine, spectrum_of, wrap_piston
+from .tilt_start import Spectrum, fold, refine, spectrum_of, wrap_piston
 
 __all__ = ["UNIFORM", "fit_tilted", "shares"]
 
 SAMPLE = 8192  # pixels by which the plane is found before all of them are asked
-STEPS, MORE = 12, 4  # Newton steps with the sample, and with all pixels
-ENOUGH = 1e-4  # squared Newton decrement: the step that is left is this much of a standard deviation, squared
+STEPS = 12  # Newton steps at most
+# squared Newton decrements, in standard deviations of the coefficients, below which one more step is the last: with the
+# sample, whose own error is 1, and with all pixels, where what the last step leaves is of its order squared
+ROUGH, NEARLY = 0.1, 3.0
+LEFT = 0.01  # what may be left at the fit of the pixels
 STARTS = 3  # planes that are tried where the spectrum says that another one may be better
 LEAST_SHARE = 0.95  # of the posterior that the maximum must hold
 UNIFORM = pi / 12**0.5  # standard deviation of a phase that is not known
 NO_ANSWER = int(Status.MASKED | Status.NON_FINITE | Status.NOT_CONVERGED)
+FAR = 2 * pi  # slopes beyond the main peak of a spectrum
 BENDS = 2 * pi / pi**2  # curvature at which a Gaussian piston fills its range
 SURE = 30.0  # lead, in nats, at which derivatives alone are believed
 QUARTERS = (0.0, 0.25 * pi, 0.5 * pi, 0.75 * pi)
@@ -113,7 +117,7 @@ def _fit_frame(model: Model, measurement: Measurement, start: Fit | None, progre
     if single == plain:
         last = _at(plane, pixels, found.coefficients, pixels.at_fit(found.coefficients, best))
         step = _step(last)
-        if step @ last.curvature @ step > 1.0:  # other maxima of the pixels than those of the search
+        if step @ last.curvature @ step > LEFT:  # other maxima of the pixels than those of the search
             coefficients = fold(found.coefficients + step, pixels.frame)
             best = fit(plain, untilt(measurement, plane.phase(coefficients, measurement.shape)), best, progress)
             last = _at(plane, pixels, coefficients, pixels.at_fit(coefficients, best))
@@ -175,14 +179,19 @@ def _with_likely_sigma(plain: Model, measurement: Measurement, plane: TiltPlane,
 
 
 class _Place(NamedTuple):
-    """A plane, the log posterior there with its derivatives by the coefficients, and what the pixels say."""
+    """A plane, the log posterior there with its derivatives by the coefficients, and what the pixels say.
+
+    ``phasors`` Z: what a pixel says of any phase is about ``Re(Z e^{-2 i phi})``; ``height`` is its sum at the plane.
+    """
 
     coefficients: np.ndarray
     value: float
     gradient: np.ndarray
     curvature: np.ndarray
     phasors: np.ndarray
+    height: float
     follow: np.ndarray
+    spectrum: Spectrum | None = None
 
 
 def _at(plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, said: Any) -> _Place:
@@ -193,8 +202,11 @@ def _at(plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, said: Any) -
     precision[0] = 0
     gradient = gradient - precision * coefficients
     value = float(np.sum(said.value)) + float(plane.log_prior(coefficients))
-    waves = (-0.25 * said.bend + 0.5j * said.slope) * np.exp(2j * said.phase)
-    return _Place(coefficients, value, gradient, curvature + np.diag(precision), waves, said.follow)
+    waves = -0.25 * said.bend + 0.5j * said.slope
+    return _Place(
+        coefficients, value, gradient, curvature + np.diag(precision), waves * np.exp(2j * said.phase),
+        float(np.sum(waves.real)), said.follow,
+    )  # fmt: skip
 
 
 def _step(place: _Place) -> np.ndarray:
@@ -205,21 +217,20 @@ def _step(place: _Place) -> np.ndarray:
 
 
 def _search(plane: TiltPlane, pixels: Pixels, earlier: np.ndarray | None) -> _Place:
-    """The best plane, as far as the spectra tell."""
-    suggested = pixels.suggestions()
-    coefficients = _first(plane, suggested) if earlier is None else np.array(earlier, float)
+    """The best plane, as far as the spectra tell, and what the pixels say there or a small step beside it."""
+    coefficients = _first(plane, pixels.suggestions()) if earlier is None else np.array(earlier, float)
     tried: list[_Place] = []
     for _ in range(STARTS):
         if pixels.count > 2 * SAMPLE:
             some = np.arange(0, pixels.count, -(-pixels.count // SAMPLE) | 1)
-            coefficients = _climb(plane, pixels, coefficients, some, STEPS).coefficients
-        tried.append(_climb(plane, pixels, coefficients, None, MORE if pixels.count > 2 * SAMPLE else STEPS))
+            coefficients = _climb(plane, pixels, coefficients, some, STEPS, ROUGH).coefficients
+        place = _climb(plane, pixels, coefficients, None, STEPS, NEARLY)
+        tried.append(place._replace(spectrum=spectrum_of(pixels.spread(place.phasors))))
         other = _better(plane, pixels, tried)
         if other is None:
             break
         coefficients = other
-    best = max(tried, key=lambda place: place.value)
-    return best._replace(coefficients=fold(best.coefficients, pixels.frame))
+    return max(tried, key=lambda place: place.value)
 
 
 def _first(plane: TiltPlane, phasors: np.ndarray) -> np.ndarray:
@@ -234,32 +245,33 @@ def _first(plane: TiltPlane, phasors: np.ndarray) -> np.ndarray:
 def _better(plane: TiltPlane, pixels: Pixels, tried: list[_Place]) -> np.ndarray | None:
     """A plane away from those that were tried, which by what the pixels say has a higher posterior; None: there is none."""
     place = tried[-1]
-    phasors = pixels.spread(place.phasors)
-    spectrum = spectrum_of(phasors)
+    spectrum = place.spectrum
+    assert spectrum is not None
+    own = place.height + float(plane.log_prior(place.coefficients[:3]))
+    # log I_0(x) is at most x, and a grid is up to a tenth below the peak between its points
+    if 1.1 * spectrum.highest_far(place.coefficients[1:3]) + spectrum.log_prior_peak(plane.scale) < own:
+        return None
     mass = spectrum.log_mass(plane.scale) - log(spectrum.cell)
     for other in tried:
-        mass = np.where(spectrum.near(other.coefficients[1:3], 2 * pi), -np.inf, mass)
-    own = float(np.sum(place.phasors * np.exp(-2j * pixels.phase(place.coefficients))).real)
-    own += float(plane.log_prior(place.coefficients[:3]))
+        mass = np.where(spectrum.near(other.coefficients[1:3], FAR), -np.inf, mass)
     top = int(np.argmax(mass))
-    # a grid is up to a tenth below the peak between its points
     if not np.isfinite(mass.flat[top]) or mass.flat[top] + 0.1 * spectrum.size.flat[top] < own:
         return None
     found = np.zeros(len(plane.terms))
     found[1:3] = spectrum.slopes(top)
-    return refine(plane, phasors, found)
+    return refine(plane, pixels.spread(place.phasors), found)
 
 
 def _climb(
-    plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, index: np.ndarray | None, steps: int
+    plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, index: np.ndarray | None, steps: int, enough: float
 ) -> _Place:
-    """Newton steps uphill, with the pixels ``index`` only."""
+    """Newton steps uphill with the pixels ``index``, the last of which is taken if its decrement is below ``enough``."""
     best: _Place | None = None
     trial, previous = coefficients, None
     for _ in range(steps):
         said = pixels.respond(trial, previous, index)
         place = _at(plane, pixels, trial, said)
-        slack = 1e-6 * abs(place.value) * (1 if said.value.dtype == np.float32 else 1e-4)
+        slack = 1e-3 + pixels.rounding * abs(place.value)
         if best is not None and place.value < best.value - slack:
             trial = 0.5 * (best.coefficients + trial)
             if np.max(np.abs(trial - best.coefficients)) < 1e-6:
@@ -267,13 +279,25 @@ def _climb(
             continue
         best, previous = place, said
         step = _step(place)
-        if step @ place.curvature @ step < ENOUGH:
-            break
+        if step @ place.curvature @ step < enough:
+            return _moved(pixels, place, step) if index is None else place._replace(coefficients=trial + step)
         # within a quarter turn the pixels' answers are those of one maximum
         reach = float(np.sum(np.abs(step) * pixels.reach))
         trial = place.coefficients + step * min(1.0, 0.5 / max(reach, 1e-12))
     assert best is not None
     return best
+
+
+def _moved(pixels: Pixels, place: _Place, step: np.ndarray) -> _Place:
+    """A small step further, where the parabola is believed."""
+    gain = float(place.gradient @ step - 0.5 * step @ place.curvature @ step)
+    coefficients = fold(place.coefficients + step, pixels.frame)
+    return place._replace(
+        coefficients=coefficients,
+        value=place.value + gain,
+        gradient=place.gradient - place.curvature @ step,
+        height=float(np.sum(place.phasors * np.exp(-2j * pixels.phase(coefficients))).real),
+    )
 
 
 def shares(found: Fit) -> np.ndarray:
@@ -329,21 +353,28 @@ def _share(plane: TiltPlane, pixels: Pixels, place: _Place) -> float:
     """How much of the posterior of the plane lies around the maximum."""
     if not pixels.count:
         return 0.0
+    assert place.spectrum is not None
     own = _invert(plane, place.curvature[:3, :3])[1] + float(plane.log_prior(place.coefficients[:3]))
-    height = float(np.sum(place.phasors * np.exp(-2j * pixels.phase(place.coefficients))).real)
-    lead = height + own - _elsewhere(plane, pixels.spread(place.phasors), place.coefficients)
+    lead = place.height + own - _elsewhere(plane, place.spectrum, place.coefficients, place.height + own - SURE)
     if lead < SURE:
         # derivatives at one phase say little of the others: ask at them
-        values = [pixels.respond(place.coefficients + shift * np.eye(len(place.coefficients))[0], None, None).value for shift in QUARTERS]
+        first = np.eye(len(place.coefficients))[0]
+        values = [pixels.respond(place.coefficients + shift * first, None, None).value for shift in QUARTERS]
         waves = 0.5 * (values[0] - values[2]) + 0.5j * (values[1] - values[3])
-        phasors = pixels.spread(waves * np.exp(2j * pixels.phase(place.coefficients)))
+        spectrum = spectrum_of(pixels.spread(waves * np.exp(2j * pixels.phase(place.coefficients))))
         height = float(np.sum(values[0] - np.mean(values, axis=0)))
-        lead = height + own - _elsewhere(plane, phasors, place.coefficients)
+        lead = height + own - _elsewhere(plane, spectrum, place.coefficients, -np.inf)
     return float(1 / (1 + np.exp(min(-lead, 700.0))))
 
 
-def _elsewhere(plane: TiltPlane, phasors: np.ndarray, coefficients: np.ndarray) -> float:
-    """Log of the posterior mass of planes away from one, over that of pixels that say the same at all phases."""
-    spectrum = spectrum_of(phasors)
-    far = ~spectrum.near(coefficients[1:3], 2 * pi)
+def _elsewhere(plane: TiltPlane, spectrum: Spectrum, coefficients: np.ndarray, enough: float) -> float:
+    """Log of the posterior mass of planes away from one, over that of pixels that say the same at all phases.
+
+    An upper bound, where that is below ``enough``.
+    """
+    bound = spectrum.highest_far(coefficients[1:3]) + spectrum.log_prior_peak(plane.scale)
+    bound += log(spectrum.cell * spectrum.size.size)
+    if bound < enough:
+        return bound
+    far = ~spectrum.near(coefficients[1:3], FAR)
     return float(np.logaddexp.reduce(spectrum.log_mass(plane.scale)[far])) if far.any() else -np.inf

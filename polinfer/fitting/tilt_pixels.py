@@ -16,7 +16,6 @@ from ..statistics import Statistics, least_squares_jones
 from ..tilting import untilt
 from . import tilt_general
 from .fast import fast_scene, judge_states
-from .fast.engine import pairs_of
 from .fast.scene import Scene
 from .fast.tilt import phase_responses
 from .generic import prepare
@@ -43,14 +42,24 @@ class Said(NamedTuple):
 
 
 class Pixels(ABC):
-    """The usable pixels of one frame ``(rows, columns)``; ``basis`` are the terms of the phase there."""
+    """The usable pixels of one frame ``(rows, columns)``; ``basis`` are the terms of the phase there.
 
-    def __init__(self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics) -> None:
-        self.plane, self.frame, self.good, self.statistics = plane, frame, good, statistics
+    ``alike`` says that their illuminations differ by a factor only.
+    """
+
+    def __init__(
+        self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics, alike: bool
+    ) -> None:
+        self.plane, self.frame, self.good, self.statistics, self.alike = plane, frame, good, statistics, alike
         left, right = plane.factors(frame)
         row, column = np.divmod(good, frame[1])
         self.basis = left[:, row] * right[:, column]
         self.reach = np.max(np.abs(left), axis=1) * np.max(np.abs(right), axis=1)
+
+    @property
+    def rounding(self) -> float:
+        """Relative error of a sum of log densities."""
+        return 10 * float(np.finfo(self.statistics.residual.dtype).eps)
 
     @property
     def count(self) -> int:
@@ -70,7 +79,12 @@ class Pixels(ABC):
 
     def suggestions(self) -> np.ndarray:
         """Phasors of ``2 (phi - xi)``, from the least-squares matrices, ``(rows, columns)``."""
-        jones = least_squares_jones(self.statistics)
+        if self.alike and self.count:  # up to a factor, which does not matter
+            inverse = np.linalg.pinv(self.statistics.illumination[0].astype(complex))
+            kind = self.statistics.response.dtype
+            jones = (self.statistics.response.reshape(-1, 2) @ inverse.astype(kind)).reshape(-1, 2, 2)
+        else:
+            jones = least_squares_jones(self.statistics)
         size = np.sum(jones.real**2 + jones.imag**2, axis=(-1, -2))
         product = jones[:, 0, 1] * np.conj(jones[:, 1, 0])
         return self.spread(product / np.where(size > 0, size, 1))
@@ -88,10 +102,10 @@ class FastPixels(Pixels):
     """Through the fast route."""
 
     def __init__(
-        self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics, scene: Scene,
-        balanced: bool,
+        self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics, alike: bool,
+        scene: Scene, balanced: bool,
     ) -> None:  # fmt: skip
-        super().__init__(plane, frame, good, statistics)
+        super().__init__(plane, frame, good, statistics, alike)
         self.scene, self.balanced = scene, balanced
 
     def _ask(self, coefficients: np.ndarray, index: np.ndarray | None, start: Any, shift: Any, steps: int) -> Said:
@@ -108,7 +122,7 @@ class FastPixels(Pixels):
         return self._ask(coefficients, index, previous.points, shift, NEXT)
 
     def at_fit(self, coefficients: np.ndarray, fit: Fit) -> Said:
-        start = pairs_of(_parameters(fit, self.good), self.statistics.residual.dtype)
+        start = np.stack(list(_parameters(fit, self.good)))
         return self._ask(coefficients, None, start, None, 0)
 
 
@@ -116,10 +130,10 @@ class GeneralPixels(Pixels):
     """Any model, by a fit of the pixels and automatic differentiation."""
 
     def __init__(
-        self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics, model: Model,
-        measurement: Measurement, fit: Callable[..., Fit],
+        self, plane: TiltPlane, frame: tuple[int, int], good: np.ndarray, statistics: Statistics, alike: bool,
+        model: Model, measurement: Measurement, fit: Callable[..., Fit],
     ) -> None:  # fmt: skip
-        super().__init__(plane, frame, good, statistics)
+        super().__init__(plane, frame, good, statistics, alike)
         self.model, self.measurement, self.fit = model, measurement, fit
 
     def respond(self, coefficients: np.ndarray, previous: Said | None, index: np.ndarray | None) -> Said:
@@ -173,8 +187,9 @@ def pixels_of(model: Model, measurement: Measurement, plane: TiltPlane, fit: Cal
     statistics = prepared.pooled.own
     if len(good) < rows * columns:
         statistics = Statistics(*(x[good] for x in statistics))
-    known = fast_scene(model)
-    usable, balanced = judge_states(statistics.illumination, statistics.residual.dtype)
+    known, n = fast_scene(model), measurement.states
+    alike = measurement.illumination.size == 2 * n and (measurement.weight is None or measurement.weight.size == n)
+    usable, balanced = judge_states(statistics.illumination[: 1 if alike else None], statistics.residual.dtype)
     if known is not None and len(good) and np.all(usable):
-        return FastPixels(plane, (rows, columns), good, statistics, known, balanced)
-    return GeneralPixels(plane, (rows, columns), good, statistics, model, measurement, fit)
+        return FastPixels(plane, (rows, columns), good, statistics, alike, known, balanced)
+    return GeneralPixels(plane, (rows, columns), good, statistics, alike, model, measurement, fit)

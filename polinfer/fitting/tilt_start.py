@@ -41,7 +41,15 @@ class Spectrum(NamedTuple):
             if len(slopes) > 1:
                 density = -0.5 * (slopes / scale) ** 2 - log(scale) - 0.5 * log(2 * pi)
                 prior = prior + np.expand_dims(density, 1 - axis)
-        return np.log(i0e(self.size)) + self.size + prior + log(self.cell)
+        return np.log(i0e(self.size.astype(float))) + self.size + prior + log(self.cell)
+
+    def log_prior_peak(self, scale: float) -> float:
+        """The highest log density of slopes before the data."""
+        return -sum(log(scale) + 0.5 * log(2 * pi) for grid in (self.rows, self.columns) if len(grid) > 1)
+
+    def highest_far(self, slopes: np.ndarray) -> float:
+        """The largest value outside the main peak around slopes."""
+        return float(np.max(self.size, where=~self.near(slopes, 2 * pi), initial=-np.inf))
 
     def slopes(self, place: int) -> np.ndarray:
         """Slopes of a cell, by its flat index."""
@@ -52,7 +60,7 @@ class Spectrum(NamedTuple):
         """Cells whose slopes both differ by less, aliases included."""
         found = []
         for grid, slope in ((self.rows, slopes[0]), (self.columns, slopes[1])):
-            period = len(grid) * (grid[1] - grid[0]) if len(grid) > 1 else 1.0
+            period = len(grid) * (grid[1] - grid[0]) if len(grid) > 1 else 1.0  # the first two are neighbours
             apart = grid - slope
             found.append(np.abs(apart - period * np.round(apart / period)) < within)
         return found[0][:, None] & found[1]
@@ -61,15 +69,14 @@ class Spectrum(NamedTuple):
 def spectrum_of(phasors: np.ndarray) -> Spectrum:
     """The spectrum of Z ``(rows, columns)``; 0 where a pixel says nothing."""
     padded = [1 if n == 1 else scipy.fft.next_fast_len(2 * n) for n in phasors.shape]
-    size = np.abs(scipy.fft.fft2(phasors, s=padded))
+    # a maximum is looked for, and refined in double precision
+    size = np.abs(scipy.fft.fft2(phasors.astype(np.complex64), s=padded, workers=2))
     grids, cell = [], 1.0
     for n, length in zip(phasors.shape, padded, strict=True):
         grid = np.fft.fftfreq(length) * n * pi
         grids.append(grid)
         cell *= pi * n / length if length > 1 else 1.0
-    order = [np.argsort(grid) for grid in grids]
-    size = size[np.ix_(*order)].astype(float)
-    return Spectrum(grids[0][order[0]], grids[1][order[1]], size, cell)
+    return Spectrum(grids[0], grids[1], size, cell)
 
 
 def refine(plane: TiltPlane, phasors: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

@@ -93,7 +93,9 @@ def calibration_ranks(
     if model.neighbours is not None:
         raise ValueError("model has neighbours; calibrate it without, every simulation is a pixel of its own.")
     if isinstance(model.misalignment, TiltPlane):
-        raise ValueError("model has a TiltPlane, which ties all pixels; calibrate it without, every simulation is a pixel.")
+        raise ValueError(
+            "model has a TiltPlane, which ties all pixels; calibrate it without, every simulation is a pixel."
+        )
     generator, seed = as_generator(rng)
     truth = Parameters(
         *(

@@ -86,8 +86,6 @@ def _residuals(
     return jnp.sum(jnp.real(rest) ** 2 + jnp.imag(rest) ** 2, axis=(-1, -2)) + statistics.residual
 
 
-
-
 def _summary(draws: Draws) -> Summary:
     """Statistics in the unit of sigma where it is known, in that of the response where it was drawn."""
     known = None if draws.sigma is not None else draws.model.noise.sigma(draws.measurement)
@@ -162,9 +160,7 @@ def predict(draws: Draws, rng: int | np.random.Generator | None, count: int, res
                       seed)  # fmt: skip
 
 
-def _device(
-    draws: Draws, used: np.ndarray, pixels: np.ndarray
-) -> tuple[Parameters, jax.Array, jax.Array | None]:
+def _device(draws: Draws, used: np.ndarray, pixels: np.ndarray) -> tuple[Parameters, jax.Array, jax.Array | None]:
     """Parameters, gain and the phase of the tilt ``(draw, pixel)`` as JAX arrays in the precision of the measurement."""
     complex_type = jax.dtypes.canonicalize_dtype(draws.measurement.response.dtype)
     real_type = np.zeros((), complex_type).real.dtype

@@ -159,7 +159,9 @@ def test_masked_and_broken_pixels_do_not_count():
 def test_a_free_gain_and_the_other_ordering(gain):
     model = Model(ORDERINGS["polariser_first"], gain=GAINS[gain], misalignment=TiltPlane())
     rng = np.random.default_rng(5)
-    truth = Parameters(*(x.reshape(SHAPE) for x in uniform(SHAPE[0] * SHAPE[1], 5)))._replace(circularity=rng.normal(0, 0.7, SHAPE))
+    truth = Parameters(*(x.reshape(SHAPE) for x in uniform(SHAPE[0] * SHAPE[1], 5)))._replace(
+        circularity=rng.normal(0, 0.7, SHAPE)
+    )
     data = simulate(model, truth, UNBALANCED, 0.05, rng=1, tilt=plane(SHAPE, 0.2, 12.0, 3.0))
     result = fit(model, data)
     assert np.all(np.abs(deviation(result, 0.2, 12.0, 3.0)) < 4)

@@ -50,9 +50,10 @@ def test_what_the_draws_predict_is_what_was_measured(draws, data):
     check = draws.predictive(rng=1, draws=100, responses=True)
     assert np.mean(check.p_value) > 0.3  # 1e-3 and less without the tilt
     assert np.abs(check.response.mean(axis=0) - data.response).max() < 0.05 * 6
-    opinion = leave_one_out(draws)
-    assert np.mean(opinion.trusted) > 0.3
-    assert np.nansum(opinion.log_density) > 0.5 * float(np.sum(fit(TILTED, data).log_evidence))
+    # what draws foretell of a state falls short of what the truth does, by about the five parameters
+    told = Model().log_likelihood(plate(SMALL, 0.3), data, tilt=plane(SMALL, *SLOPES))
+    short = np.asarray(told) - leave_one_out(draws).log_density
+    assert 2 < np.mean(short) < 10
 
 
 def test_parts_of_a_frame_share_the_draws_of_its_tilt(draws, data):

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ...records import Parameters
 from ...statistics import Statistics
 from ...threads import each
 from . import kernel
@@ -34,10 +33,11 @@ from .climb import (
     evaluate,
     frozen,
     held,
+    kept,
     with_prior,
 )
 from .data import Data, prepare
-from .engine import BLOCKS, pairs_of
+from .engine import BLOCKS
 from .linear import Triangle, factorise, solve
 from .overlap import Pauli, coefficients, energy, imaginary, overlap_slopes, turned
 from .point import Point, Vector, dot, polariser_vectors, retarder_vectors, unit
@@ -190,8 +190,8 @@ def _respond(
     point = jax.tree.map(partial(jnp.where, given != kernel.CLOSED_FORM), Point(*told), closed)
     point = climb(scene, balanced, data, point, iterations, given != kernel.STAY)
     value, at = evaluate(scene, data, point)
-    likelihood = derivatives(scene, balanced, data, point, at)
-    change = _likelihood(scene, balanced, data, point, at)
+    likelihood = kept(one, derivatives(scene, balanced, data, point, at))
+    change = jax.tree.map(lambda x: x / one, _likelihood(scene, balanced, data, point, at))
     whole = with_prior(scene.prior, point, likelihood)
     stuck = frozen(scene, point, whole.gradient)
     own = _eliminate(scene, held(whole, stuck), _with_prior(scene.prior, point, change), stuck)
@@ -221,19 +221,30 @@ def _respond(
     return jnp.stack([jnp.broadcast_to(x, value.shape) for x in rows])
 
 
+@jax.jit
+def _pairs(parameters: Any) -> Any:
+    """Points ``(10, pixels)`` of parameters ``(5, pixels)``: :func:`engine.pairs_of` in compiled code."""
+    angles = [0.5 * jnp.arcsin(jnp.clip(parameters[0], -1, 1))]
+    angles += [factor * x for factor, x in zip(FACTORS[1:], parameters[1:], strict=True)]
+    return jnp.stack([f(x) for x in angles for f in (jnp.cos, jnp.sin)])
+
+
 def phase_responses(
     scene: Scene, balanced: bool, statistics: Statistics, phase: np.ndarray, start: np.ndarray | None,
     shift: np.ndarray | None, iterations: int,
 ) -> Response:  # fmt: skip
     """What pixels ``(pixels)`` with statistics of their own say about the phase, at ``phase`` (pixels).
 
-    ``start``: points ``(10, pixels)`` and by how much the phase has changed since, or None: the closed form.
+    ``start``: points ``(10, pixels)`` and by how much the phase has changed since, parameters ``(5, pixels)``, from which
+    no change to an equivalent set is made, or None: the closed form.
     """
     pixels, dtype = len(statistics.residual), statistics.residual.dtype
     size = BLOCKS[0] if pixels <= BLOCKS[0] else BLOCKS[1]
     out = np.empty((18, pixels), dtype)
     nothing, none = kernel.no_start(size, dtype), jnp.zeros(size, dtype)
-    given = kernel.CLOSED_FORM if start is None else kernel.GIVEN
+    given = kernel.CLOSED_FORM
+    if start is not None:
+        given = kernel.STAY if len(start) == 5 else kernel.GIVEN
     phase = phase.astype(dtype)
 
     def work(begin: int) -> None:
@@ -242,11 +253,10 @@ def phase_responses(
         if end - begin < size:
             take = np.concatenate([np.arange(begin, end), np.full(size - end + begin, begin)])
         part = Statistics(*(x[take] for x in statistics))
-        begun = nothing if start is None else start[:, take].astype(dtype)
+        begun: Any = nothing if start is None else start[:, take].astype(dtype, copy=False)
+        begun = _pairs(begun) if len(begun) == 5 else begun
         moved = none if shift is None else shift[take].astype(dtype)
-        rows = _respond(
-            scene, balanced, part, phase[take], begun, moved, given, iterations, dtype.type(1)
-        )
+        rows = _respond(scene, balanced, part, phase[take], begun, moved, given, iterations, dtype.type(1))
         out[:, begin:end] = np.asarray(rows)[:, : end - begin]
 
     each(work, range(0, pixels, size))
