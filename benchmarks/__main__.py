@@ -10,7 +10,20 @@ import inspect
 import jax
 
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
-ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "misalignment", "posterior", "calibration")
+ALL = (
+    *QUICK,
+    "peers",
+    "chain",
+    "parts",
+    "hard_cases",
+    "ordering",
+    "misalignment",
+    "posterior",
+    "calibration",
+    "texture",
+    "contrast",
+    "cohort_contrast",
+)
 
 
 def main() -> None:

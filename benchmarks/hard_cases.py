@@ -5,8 +5,8 @@ Unless a case says otherwise: truths from the priors, balanced states, amplitude
 
 ``deficit`` (nat): log posterior of the best start less that of the reported parameters, both by ``benchmarks.oracle``
     in double precision on the data as they were given (in single precision the rounded data). The starts are random
-    ones, the truth and the fit itself; in single precision the maxima in double precision and the fit. At a
-    signal-to-noise ratio of 1e8 the formulas themselves, sums of squared residuals, are rounded by some 1e-7 nat. A
+    ones, the truth and the fit itself; in single precision the maxima and the fit in double precision, and the fit. At
+    a signal-to-noise ratio of 1e8 the formulas themselves, sums of squared residuals, are rounded by some 1e-7 nat. A
     point in single precision, and D next to 1 in either, cannot come as near to the maximum as wished: D moves in steps
     of eps, and J with the square root of 1 - D. So the reference is the lower of the maximum and the maximum with its
     five numbers rounded to the type of the result; ``raw`` is the deficit from the maximum itself.
@@ -208,6 +208,10 @@ def status_errors(case: Case, model: Model, gain: str, scene: Scene, result: Fit
     freedom = 4 * states.shape[-1] - np.minimum(5 + (0 if gain == "unit" else 2), 4 * rank)
     p = np.where(freedom > 0, chi2.sf(chi, np.maximum(freedom, 1)), 1)
     clear = np.abs(p / BAD_FIT_PROBABILITY - 1) > SLACK[dtype]
+    least, most = rounding_of_chi_square(model, oracle, point, response, states, case.sigma, dtype)
+    clear &= (chi2.sf(least, np.maximum(freedom, 1)) < BAD_FIT_PROBABILITY) == (
+        chi2.sf(most, np.maximum(freedom, 1)) < BAD_FIT_PROBABILITY
+    )
     bad = (status & Status.BAD_FIT) != 0
     expected = 1.0 if gain in case.bad else BAD_FIT_PROBABILITY
     wrong["BAD_FIT"] = np.sum(clear & (bad != (p < BAD_FIT_PROBABILITY)))
@@ -237,6 +241,29 @@ def chi_square(model: Model, oracle: Oracle, point: np.ndarray, response: np.nda
         best = np.sum(field.conj() * response, axis=(-1, -2)) / (power + sigma**2 / model.gain.scale**2)
         field = best[:, None, None] * field
     return 2 * np.sum(np.abs(field - response) ** 2, axis=(-1, -2)) / sigma**2
+
+
+def rounding_of_chi_square(model: Model, oracle: Oracle, point: np.ndarray, response: np.ndarray, states: np.ndarray,
+                           sigma: float, dtype: str) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Between which values chi-square may have been before the reported points were rounded.
+
+    In single precision that of the maximum beside them is one; in double precision the next values of D say how much a
+    rounding changes.
+    """
+    own, size, sign = chi_square(model, oracle, point, response, states, sigma), np.abs(point[0]), np.sign(point[0])
+
+    def at(d: np.ndarray, climb: bool) -> np.ndarray:
+        other = np.concatenate([(sign * d)[None], point[1:]])
+        with np.errstate(all="ignore"):
+            other = oracle.climb(other, response, states, sigma)[0] if climb else other
+            return chi_square(model, oracle, other, response, states, sigma)
+
+    if dtype == "complex64":
+        other = at(np.minimum(size, 1 - sigma**2), True)  # from a bound itself no slope leads away
+        return np.minimum(own, other), np.maximum(own, other)
+    near = (np.nextafter(size, 0), np.minimum(np.nextafter(size, 2), 1))
+    change = np.max([np.abs(at(d, False) - own) for d in near], axis=0)
+    return own - change, own + change
 
 
 def deviations(oracle: Oracle, point: np.ndarray, response: np.ndarray, states: np.ndarray,
@@ -278,6 +305,7 @@ def rows_of(case: Case, model: Model, gain: str, pixels: int, checked: int, star
         seen, states = scene.response[few], scene.states[few]
         best, top = oracle.maximum(seen, states, case.sigma, starts, rng)
         best, top = better(best, top, *oracle.climb(np.array(scene.truth)[:, few], seen, states, case.sigma))
+    precise = best  # where the fit in double precision ends: a start for single precision
     for dtype, real in (("complex128", float), ("complex64", np.float32)):
         if dtype == "complex64" and case.double_only:
             continue
@@ -288,7 +316,9 @@ def rows_of(case: Case, model: Model, gain: str, pixels: int, checked: int, star
         with np.errstate(all="ignore"):
             own = oracle.log_posterior(at, *part)
             peak, reference = better(*oracle.climb(np.nan_to_num(best), *part), *oracle.climb(at, *part))
+            peak, reference = better(peak, reference, *oracle.climb(np.nan_to_num(precise), *part))
             rounded = oracle.log_posterior(peak.astype(real).astype(float), *part)
+            precise = at if dtype == "complex128" else precise
         raw = np.nan_to_num(reference - own, nan=np.inf)
         deficit = np.nan_to_num(np.minimum(reference, rounded) - own, nan=np.inf)
         row = {"case": case.name, "ordering": type(model.ordering).__name__, "gain": gain, "dtype": dtype,

@@ -38,9 +38,11 @@ class Oracle:
 
     def jones(self, point: Any) -> np.ndarray:
         """Matrices ``(2, 2, ...)``."""
-        d, td, eta, te, xi = point
-        plus, minus = np.sqrt(np.maximum(1 + d, 0)), np.sqrt(np.maximum(1 - d, 0))
-        mean, half = 0.5 * (plus + minus), 0.5 * (plus - minus)
+        plus, minus = np.sqrt(np.maximum(1 + point[0], 0)), np.sqrt(np.maximum(1 - point[0], 0))
+        return self._jones(0.5 * (plus + minus), 0.5 * (plus - minus), *point[1:])
+
+    def _jones(self, mean: Any, half: Any, td: Any, eta: Any, te: Any, xi: Any) -> np.ndarray:
+        """The same from the cosine and the sine of delta / 2: D itself is rounded next to 1, where J is steep in it."""
         c, s = np.cos(eta / 2), np.sin(eta / 2)
         off = -1j * s * np.sin(2 * te)
         diagonal = 1j * s * np.cos(2 * te)
@@ -51,7 +53,10 @@ class Oracle:
 
     def log_likelihood(self, point: Any, response: np.ndarray, illumination: np.ndarray, sigma: float) -> Any:
         """Log density of the data, the gain integrated out."""
-        matrix, n = self.jones(point), illumination.shape[-1]
+        return self._log_likelihood(self.jones(point), response, illumination, sigma)
+
+    def _log_likelihood(self, matrix: np.ndarray, response: np.ndarray, illumination: np.ndarray, sigma: float) -> Any:
+        n = illumination.shape[-1]
         pairs = [
             (matrix[i][0] * illumination[..., 0, k] + matrix[i][1] * illumination[..., 1, k], response[..., i, k])
             for i in range(2)
@@ -119,8 +124,9 @@ class Oracle:
 
         def value_of(u: np.ndarray, rows: Any) -> np.ndarray:
             angles = angles_of(u)
-            place = np.concatenate([np.sin(angles[:1]), angles[1:]])
-            return np.asarray(self.log_posterior(place, response[rows], illumination[rows], sigma))
+            matrix = self._jones(np.cos(angles[0] / 2), np.sin(angles[0] / 2), *angles[1:])
+            prior = self.log_prior((np.sin(angles[0]), *angles[1:]))
+            return np.asarray(self._log_likelihood(matrix, response[rows], illumination[rows], sigma) + prior)
 
         active = np.arange(point.shape[1])
         value, damping = value_of(u, active), np.full(point.shape[1], 1e-2)

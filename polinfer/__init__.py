@@ -1,6 +1,6 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
-from . import conventions, datasets, phantoms
+from . import contrast, conventions, datasets, phantoms, texture
 from .bounds import cramer_rao_bound, tilt_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
@@ -49,6 +49,7 @@ __all__ = [
     "calibration_ranks",
     "canonicalise",
     "compare",
+    "contrast",
     "conventions",
     "cramer_rao_bound",
     "datasets",
@@ -66,6 +67,7 @@ __all__ = [
     "simulate",
     "smooth_gauge",
     "summarise",
+    "texture",
     "tilt_bound",
     "untilt",
 ]

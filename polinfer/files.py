@@ -22,6 +22,7 @@ from .sampling.ensemble import Ensemble
 from .sampling.gibbs import Gibbs
 from .sampling.predictive import Predictive
 from .sampling.summaries import Summary
+from .texture import Angle, Bounded, Chi, FitTexture, Rescaled, Texture
 
 __all__ = ["TYPES", "load"]
 
@@ -30,6 +31,7 @@ TYPES: tuple[type, ...] = (
     Draws, Summary, Diagnostics, Predictive, Gibbs, Ensemble,
     RetarderFirst, PolariserFirst,
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
+    Texture, FitTexture, Angle, Bounded, Chi, Rescaled,
     KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,
     TiltPlane, RotatedBasis, Tilt,
 )  # fmt: skip

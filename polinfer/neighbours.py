@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .box_sums import run_sums
 from .checks import integer
 from .gain import ComplexGain, Gain, UnitGain
 from .noise import Noise
@@ -68,20 +69,14 @@ def _along(values: np.ndarray, length: int) -> np.ndarray:
     length = min(length, 2 * n - 1)
     if length == 1:
         return values
-    half = length // 2
-    # Running sums from both ends of blocks as long as the window: a window meets at most two blocks. Sums of whole
-    # lines and their differences would cost digits, these do not subtract.
-    blocks = -(-(n + 2 * half) // length)
-    padded = np.zeros((values.shape[0], blocks * length, *values.shape[2:]), values.dtype)
-    padded[:, half : half + n] = values
-    block = padded.reshape(values.shape[0], blocks, length, *values.shape[2:])
-    forward = np.cumsum(block, axis=2).reshape(padded.shape)
-    backward = np.cumsum(block[:, :, ::-1], axis=2)[:, :, ::-1].reshape(padded.shape)
-    total = backward[:, :n].copy()
-    last = np.arange(n) + length - 1
-    split = last % length != length - 1  # the window is not one block
-    total[:, split] += forward[:, last[split]]
-    return total
+    # zeros on both sides: a window that leaves one line ends in them, before the next one begins
+    padded = np.zeros((values.shape[0], n + length - 1, *values.shape[2:]), values.dtype)
+    padded[:, length // 2 : length // 2 + n] = values
+    flat = padded.reshape(-1)
+    step = int(np.prod(values.shape[2:], dtype=np.int64))
+    spare = np.empty((3, flat.size), flat.dtype)
+    run_sums(flat, length, step, spare)
+    return spare[0].reshape(padded.shape)[:, :n]
 
 
 def box_sum(values: np.ndarray, window: Window, trailing: int = 0) -> np.ndarray:

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 
+    from .phantoms import Phantom
     from .sampling.summaries import Summary
 
-__all__ = ["colour_circle", "plot_fit", "plot_summary"]
+__all__ = ["colour_circle", "draw_map", "explain", "plot_fit", "plot_phantom", "plot_summary", "two_rows"]
 
 TITLES = Parameters(
     "diattenuation", "diattenuation angle (°)", "retardance (°)", "retardance angle (°)", "circularity (°)"
@@ -78,7 +79,7 @@ def _scale_bar(axes: Any, columns: int, pixel_size: float) -> None:
     axes.add_artist(bar)
 
 
-def _draw(
+def draw_map(
     axes: Any,
     title: str,
     values: np.ndarray,
@@ -130,11 +131,11 @@ def _draw(
         _scale_bar(axes, image.shape[1], pixel_size)
 
 
-def _figure(status: np.ndarray, columns: int, pixel_size: float | None) -> tuple[Figure, np.ndarray]:
-    """A figure with two rows of maps, as high as the pixels ask for."""
+def two_rows(pixels: np.ndarray, columns: int, pixel_size: float | None) -> tuple[Figure, np.ndarray]:
+    """A figure with two rows of maps, as high as ``pixels``, one of the maps, ask for."""
     from matplotlib.figure import Figure
 
-    high, wide = _image(status).shape
+    high, wide = _image(pixels).shape
     height = min(max(2.2 * high / wide, 0.7), 3.0)
     figure = Figure(figsize=(2.9 * columns, 2 * (height + (0.5 if pixel_size is None else 0.7)) + 0.2),
                     layout="constrained")  # fmt: skip
@@ -152,12 +153,12 @@ def _draw_parameters(
         unknown = ~lost & ((status & int(Status.unidentified(name))) != 0)
         grey = grey or bool(np.any(unknown))
         period = None if name == "diattenuation" else unit * getattr(PERIODS, name)
-        _draw(axes[0, i], getattr(TITLES, name), value, lost, period, unknown=unknown, pixel_size=pixel_size)
+        draw_map(axes[0, i], getattr(TITLES, name), value, lost, period, unknown=unknown, pixel_size=pixel_size)
         # a width beyond that of a uniform distribution says no more than "unknown" and would hide all others
         ceiling = (2 if period is None else period) / 12**0.5
         title = "± standard deviation" if period is None else "± standard deviation (°)"
         dropped = ~lost & np.isnan(width)
-        _draw(axes[1, i], title, width, lost, high=ceiling, unknown=dropped, pixel_size=pixel_size)
+        draw_map(axes[1, i], title, width, lost, high=ceiling, unknown=dropped, pixel_size=pixel_size)
     return grey
 
 
@@ -167,11 +168,11 @@ def _draw_tilt(axes: np.ndarray, fit: Fit, pixel_size: float | None) -> None:
     unknown = (np.asarray(fit.status) & int(Status.TILT_UNIDENTIFIED)) != 0
     known = np.zeros(np.shape(unknown), bool)
     phase, width = np.degrees(fit.tilt.phase), np.degrees(fit.tilt.phase_std)
-    _draw(axes[0], "tilt (°)", phase, known, unknown=unknown, pixel_size=pixel_size)
-    _draw(axes[1], "± standard deviation (°)", width, known, high=np.inf, pixel_size=pixel_size)
+    draw_map(axes[0], "tilt (°)", phase, known, unknown=unknown, pixel_size=pixel_size)
+    draw_map(axes[1], "± standard deviation (°)", width, known, high=np.inf, pixel_size=pixel_size)
 
 
-def _explain(figure: Figure, grey: bool, hatched: bool, smooth: bool) -> None:
+def explain(figure: Figure, grey: bool, hatched: bool, smooth: bool) -> None:
     """What grey and hatched pixels mean, and which gauge it is."""
     from matplotlib.patches import Patch
 
@@ -215,20 +216,20 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
     status = np.asarray(fit.status)
     lost = (status & _NO_ANSWER) != 0
     extra = (1 if fit.gain is None else 2) + (fit.tilt is not None)
-    figure, axes = _figure(status, 5 + extra, pixel_size)
+    figure, axes = two_rows(status, 5 + extra, pixel_size)
     quality = axes[1] if fit.gain is not None else axes[:, 0]
     if fit.gain is not None:
-        _draw(axes[0, 0], "amplitude", np.abs(fit.gain), lost, pixel_size=pixel_size)
-        _draw(axes[0, 1], "phase (°)", np.degrees(np.angle(fit.gain)), lost, period=360.0, pixel_size=pixel_size)
+        draw_map(axes[0, 0], "amplitude", np.abs(fit.gain), lost, pixel_size=pixel_size)
+        draw_map(axes[0, 1], "phase (°)", np.degrees(np.angle(fit.gain)), lost, period=360.0, pixel_size=pixel_size)
     freedom = np.asarray(fit.degrees_of_freedom)
-    _draw(quality[0], "χ² / degrees of freedom", fit.chi_square / np.maximum(freedom, 1), lost | (freedom == 0),
+    draw_map(quality[0], "χ² / degrees of freedom", fit.chi_square / np.maximum(freedom, 1), lost | (freedom == 0),
           high=np.inf, pixel_size=pixel_size)  # fmt: skip
-    _draw(quality[1], "log evidence (nat)", fit.log_evidence, lost, pixel_size=pixel_size)
+    draw_map(quality[1], "log evidence (nat)", fit.log_evidence, lost, pixel_size=pixel_size)
     if fit.tilt is not None:
         _draw_tilt(axes[:, extra - 1], fit, pixel_size)
     parameters = smooth_gauge(fit.parameters, status) if smooth else fit.parameters
     grey = _draw_parameters(axes[:, extra:], parameters, fit.std, status, pixel_size)
-    _explain(figure, grey, bool(lost.any()), smooth)
+    explain(figure, grey, bool(lost.any()), smooth)
     return figure
 
 
@@ -261,14 +262,84 @@ def plot_summary(summary: Summary, smooth: bool = False, pixel_size: float | Non
         pixel_size = real_number("pixel_size", pixel_size, above=0)
     status = np.asarray(summary.status)
     lost = (status & _NO_ANSWER) != 0
-    figure, axes = _figure(status, 6, pixel_size)
+    figure, axes = two_rows(status, 6, pixel_size)
     # how the chains fare is shown where it is bad, too
     none = np.isnan(summary.ess)
     # infinite where no chain has moved
     excess = np.minimum(summary.r_hat - 1, 10.0)
-    _draw(axes[0, 0], "largest R-hat − 1", excess, none, high=np.inf, pixel_size=pixel_size)
-    _draw(axes[1, 0], "fewest effective draws", summary.ess, none, high=np.inf, pixel_size=pixel_size)
+    draw_map(axes[0, 0], "largest R-hat − 1", excess, none, high=np.inf, pixel_size=pixel_size)
+    draw_map(axes[1, 0], "fewest effective draws", summary.ess, none, high=np.inf, pixel_size=pixel_size)
     parameters = smooth_gauge(summary.mean, status) if smooth else summary.mean
     grey = _draw_parameters(axes[:, 1:], parameters, summary.std, status, pixel_size)
-    _explain(figure, grey, bool(lost.any()), smooth)
+    explain(figure, grey, bool(lost.any()), smooth)
     return figure
+
+
+def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
+    """Maps of what is true in a phantom: amplitude, phase, the five parameters, tilt if there is one, regions.
+
+    A row for each frame of a series. Angles are in degrees, in colours that close on themselves.
+
+    Parameters
+    ----------
+    phantom: of shape (y, x) or (frame, y, x). pixel_size: side of a pixel, metres, > 0, for a scale bar below every
+        map; None: no bar.
+
+    Raises
+    ------
+    TypeError, ValueError: not a phantom, another shape, a pixel size out of range.
+
+    >>> import polinfer
+    >>> figure = plot_phantom(polinfer.phantoms.half_wave_plate((6, 6), [0.0, 0.3]), pixel_size=9e-6)
+    >>> [axes.get_title() for axes in figure.axes][:3]
+    ['amplitude', 'phase (°)', 'diattenuation']
+    """
+    from matplotlib.figure import Figure
+
+    from .phantoms import Phantom
+
+    one_of_types("phantom", phantom, (Phantom,), "pass one of polinfer.phantoms.")
+    if phantom.labels.ndim not in (2, 3):
+        raise ValueError(f"phantom must have shape (y, x) or (frame, y, x) to be drawn, got {phantom.labels.shape}.")
+    if pixel_size is not None:
+        pixel_size = real_number("pixel_size", pixel_size, above=0)
+    frames = [phantom] if phantom.labels.ndim == 2 else [phantom[i] for i in range(len(phantom))]
+    several = int(phantom.labels.max(initial=0)) > 0
+    columns = 7 + (phantom.tilt is not None) + several
+    high, wide = frames[0].labels.shape
+    height = min(max(2.2 * high / wide, 0.7), 3.0) + (0.3 if pixel_size is None else 0.5)
+    figure = Figure(figsize=(2.9 * columns, height * len(frames) + 0.2), layout="constrained")
+    for row, frame in zip(figure.subplots(len(frames), columns, squeeze=False), frames, strict=True):
+        maps: list[tuple[str, Any, float | None]] = [
+            ("amplitude", np.abs(frame.gain), None),
+            ("phase (°)", np.degrees(np.angle(frame.gain)), 360.0),
+        ]
+        for name, value in zip(Parameters._fields, frame.parameters, strict=True):
+            unit, period = (1.0, None) if name == "diattenuation" else (180 / pi, 180 / pi * getattr(PERIODS, name))
+            maps.append((getattr(TITLES, name), unit * value, period))
+        if frame.tilt is not None:
+            maps.append(("tilt (°)", np.degrees(np.angle(np.exp(1j * frame.tilt))), 360.0))
+        for axes, (title, value, period) in zip(row, maps, strict=False):
+            draw_map(axes, title, value, np.zeros((high, wide), bool), period, pixel_size=pixel_size)
+        if several:
+            _draw_regions(row[-1], frame.labels, int(phantom.labels.max()), phantom.names, pixel_size)
+    return figure
+
+
+def _draw_regions(axes: Any, labels: np.ndarray, top: int, names: tuple[str, ...], pixel_size: float | None) -> None:
+    """Map of labels, one colour for each, with its legend."""
+    import matplotlib
+    from matplotlib.patches import Patch
+
+    colours = matplotlib.colors.ListedColormap([matplotlib.colormaps["tab20"](k % 20) for k in range(top + 1)])
+    axes.imshow(labels, cmap=colours, vmin=-0.5, vmax=top + 0.5, interpolation="nearest")
+    axes.set_title("regions", fontsize=9)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    called = names or tuple(str(k) for k in range(top + 1))
+    axes.legend(
+        handles=[Patch(color=colours(k), label=called[k]) for k in range(top + 1)], loc="upper left",
+        bbox_to_anchor=(1.0, 1.0), fontsize=7, frameon=False,
+    )  # fmt: skip
+    if pixel_size is not None:
+        _scale_bar(axes, labels.shape[1], pixel_size)

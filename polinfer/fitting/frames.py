@@ -147,7 +147,7 @@ def _parts(
         if known is not None:
             yield fit_part(known, prepared, chosen, told)
         else:
-            yield fit_chunk(prepared, chosen, told, design)
+            yield fit_chunk(prepared, chosen, told, design, prepared.measurement.response.dtype)
 
 
 def _fit_frame(

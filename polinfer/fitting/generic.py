@@ -168,9 +168,14 @@ def chunk_size(model: Model) -> int:
     return max(CHUNK // cost, 64)
 
 
-def fit_chunk(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None, design: int | None) -> Part:
-    """Maximum, Gaussian, evidence and residuals of the pixels ``chosen``; ``earlier`` are their parameters."""
-    model, dtype, count = prepared.model, prepared.measurement.response.dtype, len(chosen)
+def fit_chunk(
+    prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None, design: int | None, dtype: np.dtype
+) -> Part:
+    """Maximum, Gaussian, evidence and residuals of the pixels ``chosen``; ``earlier`` are their parameters.
+
+    ``dtype`` is the complex type to compute in, as far as JAX has it enabled.
+    """
+    model, count = prepared.model, len(chosen)
     host: Statistics | Windowed = prepared.pooled.take(chosen)
     own = Statistics(*(x[chosen] for x in prepared.pooled.own))
     # code is compiled for a shape: pad to a power of two, and not to small ones, so that few shapes occur

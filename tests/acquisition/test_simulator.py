@@ -137,7 +137,7 @@ def test_an_effect_is_there_only_when_declared(name):
 def test_a_finer_sample_of_a_flat_scene_makes_the_same_field():
     flat = phantoms.Phantom(
         type(SCENE.phantom.parameters)(*(np.full((8, 8), x) for x in (0.2, 0.3, 1.0, 0.4, 0.1))),
-        np.full((8, 8), 0.7 + 0.2j), np.zeros((8, 8), np.int32),
+        np.full((8, 8), 0.7 + 0.2j),
     )  # fmt: skip
     settings = {"shot_noise": False, "read_noise": 0.0, "gain": 0.01, "bits": 16}
     coarse, fine = (

@@ -28,7 +28,22 @@ def test_one_pixel(tmp_path):
     assert isinstance(polinfer.load(tmp_path / "one_pixel.nc"), polinfer.Fit)
 
 
+def test_texture(tmp_path):
+    assert "noise taken out" in run("04_texture.py", tmp_path)
+    assert isinstance(polinfer.load(tmp_path / "texture.nc"), polinfer.texture.FitTexture)
+
+
 def test_measured_fibre(tmp_path):
     fibre_folder()
     assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)
     assert (tmp_path / "measured_fibre.png").stat().st_size > 10_000
+
+
+def test_phantoms(tmp_path):
+    assert "stretched gel" in run("05_phantoms.py", tmp_path)
+    assert (tmp_path / "speckle.png").stat().st_size > 10_000
+
+
+def test_contrast(tmp_path):
+    assert "gCNR" in run("06_contrast.py", tmp_path)
+    assert (tmp_path / "contrast.png").stat().st_size > 10_000

@@ -78,7 +78,7 @@ def test_hard_corners_converge_and_are_never_nan_where_ok(gain):
     for sigma in (1e-8, 1e-2, 2.0):
         data = simulate(model, truth, BALANCED, sigma, rng=3, gain=1.0)
         result = fit(model, data)
-        # behind a perfect polariser the retarder's parameters are one curved ridge, 1e8 times longer than it is wide
+        # behind a perfect polariser a free phase leaves a ridge 1e8 times longer than it is wide: its width is rounding
         hopeless = (truth.diattenuation == 1) & (sigma < 1e-4)
         assert ((result.status & int(Status.NOT_CONVERGED) == 0) | hopeless).all()
         for values in (*result.parameters, *result.std, result.log_posterior, result.chi_square):

@@ -29,11 +29,13 @@ from .point import Point, sine_of_double
 from .priors import COPIES, FACTORS, log_prior
 from .scene import Scene
 
-__all__ = ["CONVERGED", "DOUBTFUL", "FROZEN", "NON_FINITE", "ROWS", "WIDE", "describe", "rows"]
+__all__ = ["CONVERGED", "DOUBTFUL", "FROZEN", "NON_FINITE", "ROUGH", "ROWS", "WIDE", "describe", "rows"]
 
 # bits of the flags
-CONVERGED, DOUBTFUL, NON_FINITE, WIDE = 1, 2, 4, 32
+CONVERGED, DOUBTFUL, NON_FINITE, WIDE, ROUGH = 1, 2, 4, 32, 64
 FROZEN = {0: 8, 2: 16}  # the maximum lies on a bound of the diattenuation, of the retardance
+# The gradient is a sum of products of data and model: rounded like this times eps times the square of the SNR.
+ROUNDING = 0.25
 MANY = 0.02  # variance of the angles of J (rad^2) beyond which the closed form may start in the wrong valley
 
 # rows of the result, each an array of pixels
@@ -142,7 +144,7 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
 
     The covariance is that of the parameters. Where the maximum lies on a bound (``FROZEN``) the rows of that parameter
     hold instead how the others follow the bounded angle y, and the inverse curvature along y; then the evidence leaves
-    that angle out.
+    that angle out. ``ROUGH`` marks a maximum that rounding may have missed by more than the precision promises.
     """
     if not scene.bounded:  # the other sign of J, which a free phase takes up
         c, s = point.retardance
@@ -165,9 +167,15 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
     # angles of J itself do not depend on how well axes are defined
     sine = [jnp.ones_like(value), point.diattenuation[1], jnp.ones_like(value), point.retardance[1],
             point.retardance[1] * point.retardance_angle[1]]  # fmt: skip
+    loosest = jnp.zeros_like(value)
     wide = ~(smallest > 0)
     for i in free:
-        wide = wide | (c[at_index[i], at_index[i]] * sine[i] ** 2 > MANY)
+        loose = c[at_index[i], at_index[i]] * sine[i] ** 2
+        wide = wide | (loose > MANY)
+        loosest = jnp.maximum(loosest, jnp.where(stuck[i], 0, loose) if i in stuck else loose)
+    # what is lost where a gradient that is rounding alone still moves a loose angle: twice the nats
+    eps = float(jnp.finfo(value.dtype).eps)
+    rough = (ROUNDING * eps * data.strength**2) ** 2 * loosest > (5e-4 if eps < 1e-10 else 5e-3)
 
     # evidence: this point's own prior, then those of the copies
     cosine = point.diattenuation[0] ** 2 - point.diattenuation[1] ** 2  # cos delta
@@ -192,7 +200,8 @@ def describe(scene: Scene, balanced: bool, data: Data, point: Point) -> tuple[An
         total = jnp.logaddexp(total, jnp.where(jnp.isfinite(term), term, -jnp.inf))
     evidence = value + log_volume + total
 
-    flags = flags | jnp.where(doubtful, DOUBTFUL, 0) | jnp.where(wide, WIDE, 0) | jnp.where(finite, 0, NON_FINITE)
+    flags = flags | jnp.where(doubtful, DOUBTFUL, 0) | jnp.where(wide, WIDE, 0) | jnp.where(rough, ROUGH, 0)
+    flags = flags | jnp.where(finite, 0, NON_FINITE)
     for i, where in stuck.items():
         flags = flags | jnp.where(where, FROZEN[i], 0)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import pi
 from typing import Any
 
 import jax
@@ -16,15 +17,18 @@ from ...statistics import Statistics
 from ...threads import each
 from . import kernel
 from .climb import moved
-from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROWS, WIDE, rows
+from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROUGH, ROWS, WIDE, rows
 from .point import Point
 from .priors import COPIES, FACTORS
+from .ridge import follow, turned
 from .scene import Scene
 
 __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
 
 BLOCKS = (1024, 4096)  # numbers of pixels for which code is compiled
 FIRST, MOST, LAST = 3, 60, 500  # Newton steps of the first pass, of the others, and of the last
+POLARISER = 0.9  # |D| from which on a free phase leaves the angle of the retarder about the same axis open
+TURNS = [k * pi / 6 for k in range(1, 6)]  # about that axis; pi changes the sign of J
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,13 @@ class Responses:
             scene, self.balanced, self.response[take], sigma, self.shared, start, given, iterations, self.dtype.type(1)
         )
 
+    def reduced(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """R and Y of pixels, complex ``(pixels, 2, 2)``."""
+        sigma = np.broadcast_to(self.sigma if len(self.sigma) == 1 else self.sigma[index], len(index))[:, None, None]
+        weight = self.shared.root_weight
+        seen = np.where(weight > 0, self.response[index], 0) * weight
+        return self.shared.root / sigma, seen @ self.shared.rows.conj().T / sigma
+
 
 @dataclass(frozen=True)
 class Summed:
@@ -75,6 +86,10 @@ class Summed:
         """Rows and flags of the pixels ``take``."""
         part = Statistics(*(x[take] for x in self.statistics))
         return kernel.from_statistics(scene, self.balanced, part, start, given, iterations, self.dtype.type(1))
+
+    def reduced(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """R and Y of pixels, complex ``(pixels, 2, 2)``."""
+        return self.statistics.illumination[index], self.statistics.response[index]
 
 
 Frame = Responses | Summed
@@ -180,8 +195,32 @@ def solve_frame(
         told = pairs_of(earlier, frame.dtype)
         finite = np.isfinite(told).all(axis=0)
         again(finite & ((flags & (WIDE | NON_FINITE)) == WIDE), lambda _, index: [told[:, index]])
-    again((flags & (CONVERGED | NON_FINITE)) == 0, lambda points, _: [points], kernel.PATIENT, LAST)
+    if scene.likelihood.free_phase and scene.free == (0, 1, 2, 3, 4):
+        open_turn = ((flags & (WIDE | NON_FINITE)) == WIDE) & (np.abs(out[0]) > POLARISER)
+        again(open_turn, partial(_turns, scene, frame))
+    if frame.dtype == np.float64 and scene.free == (0, 1, 2, 3, 4):
+        left = ((flags & CONVERGED) == 0) | ((flags & ROUGH) != 0)
+        again(left & (flags & NON_FINITE == 0), partial(_along_ridges, scene, frame), kernel.STAY, 0)
+    again((flags & (CONVERGED | NON_FINITE | ROUGH)) == 0, lambda points, _: [points], kernel.PATIENT, LAST)
     return out, flags
+
+
+def _turns(scene: Scene, frame: Frame, points: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+    """The same retarders turned about the axis of the diattenuator."""
+    strength = np.sqrt(np.sum(np.abs(frame.reduced(index)[1]) ** 2, axis=(-1, -2)))
+    return [turned(scene, points, alpha, strength).astype(frame.dtype) for alpha in TURNS]
+
+
+def _along_ridges(scene: Scene, frame: Frame, points: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+    """The best of the maxima that following the ridges leads to."""
+    illumination, response = frame.reduced(index)
+    illumination = np.broadcast_to(illumination, response.shape)
+    best, top, _ = follow(scene, illumination, response, points)
+    for begun in _turns(scene, frame, points, index) if scene.likelihood.free_phase else []:
+        found, value, _ = follow(scene, illumination, response, begun)
+        better = value > top + 1e-9
+        best, top = np.where(better, found, best), np.where(better, value, top)
+    return [best]
 
 
 def _again(

@@ -13,13 +13,14 @@ from scipy.special import gammainccinv
 
 from ...model import Model
 from ...noise import KnownNoise
+from ...precision import double_precision
 from ...records import Fit, Measurement, Parameters, Status
 from ...statistics import Statistics, factor
 from ..frame_noise import effective_parameters, misfit
 from ..generic import DESIGN, DESIGN_WARM, Part, Prepared, chunk_size, fit_chunk
 from ..local_gaussian import uniform_std
 from ..residuals import BAD_FIT_PROBABILITY
-from .describe import CONVERGED, FROZEN, NON_FINITE, ROWS
+from .describe import CONVERGED, FROZEN, NON_FINITE, ROUGH, ROWS
 from .edges import correct_edges
 from .engine import Frame, Responses, Summed, solve_frame
 from .kernel import Shared
@@ -34,11 +35,15 @@ BALANCED = {np.dtype(np.float64): 1e-11, np.dtype(np.float32): 1e-6}
 
 
 class Solved(NamedTuple):
-    """Rows of the result ``(rows, pixels)``, and which pixels have no answer yet."""
+    """Rows of the result ``(rows, pixels)``, and which pixels have no answer yet.
+
+    ``rough`` are those whose widths double precision cannot tell.
+    """
 
     rows: np.ndarray
     edge: np.ndarray
     lost: np.ndarray
+    rough: np.ndarray
 
 
 def _real_type(values: np.ndarray) -> np.dtype:
@@ -106,18 +111,26 @@ def solve(
     told = np.isfinite(rows[ROWS["log_evidence"]])
     for row in rows[ROWS["std"]]:
         told &= np.isfinite(row)
-    return Solved(rows, edge, (flags & CONVERGED == 0) | (flags & NON_FINITE != 0) | ~told)
+    failed, rough = (flags & NON_FINITE != 0) | ~told, (flags & ROUGH != 0)
+    if rows.dtype == np.float32:
+        return Solved(rows, edge, failed | rough | (flags & CONVERGED == 0), np.zeros_like(rough))
+    return Solved(rows, edge, failed | (~rough & (flags & CONVERGED == 0)), rough)
 
 
-def status_of(model: Model, rows: np.ndarray, edge: np.ndarray) -> np.ndarray:
-    """Status bits that follow from the rows: bounds, and what is not identified."""
-    dtype = rows.dtype
-    near = 8 * np.finfo(dtype).eps  # on a bound without a slope towards it
-    at_edge = edge.copy()
+def on_bounds(model: Model, rows: np.ndarray) -> np.ndarray:
+    """Where a parameter is a bound to within rounding."""
+    found, near = np.zeros(rows.shape[1], bool), 8 * np.finfo(rows.dtype).eps
     for name, (low, high) in model.bounds.items():
-        value = rows[Parameters._fields.index(name)]
-        at_edge |= (value <= low + near * (high - low) / 2) | (value >= high - near * (high - low) / 2)
-    status = np.where(at_edge, np.int32(Status.AT_EDGE), np.int32(0))
+        value, reach = rows[Parameters._fields.index(name)], near * (high - low) / 2
+        found |= (value <= low + reach) | (value >= high - reach)
+    return found
+
+
+def status_of(model: Model, solved: Solved) -> np.ndarray:
+    """Status bits that follow from the rows: bounds, what is not identified, and what is lost in rounding."""
+    rows = solved.rows
+    status = np.where(solved.edge | on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
+    status |= np.where(solved.rough, np.int32(Status.NOT_CONVERGED), np.int32(0))
     for name in model.free:
         std = rows[5 + Parameters._fields.index(name)]
         status |= np.where(std > 0.5 * uniform_std(name), np.int32(Status.unidentified(name)), np.int32(0))
@@ -135,12 +148,21 @@ def fast_scene(model: Model) -> Scene | None:
 
 def fit_part(known: Scene, prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None) -> Part:
     """What :func:`polinfer.fitting.generic.fit_chunk` gives, for the pixels ``chosen`` of a prepared measurement."""
-    model = prepared.model
     statistics = prepared.pooled.take(chosen)
     assert isinstance(statistics, Statistics)
+    return _fit_statistics(known, prepared, chosen, statistics, earlier)
+
+
+def _fit_statistics(
+    known: Scene, prepared: Prepared, chosen: np.ndarray, statistics: Statistics, earlier: Parameters | None
+) -> Part:
+    """The same from their statistics."""
+    model = prepared.model
     frame, usable = frame_of_statistics(statistics)
+    if not usable.any():
+        return _fit_general(prepared, chosen, earlier, frame.dtype)
     solved = solve(known, frame, earlier)
-    rows, status = solved.rows, status_of(model, solved.rows, solved.edge)
+    rows, status = solved.rows, status_of(model, solved)
     values = {name: rows[i] for i, name in enumerate(Parameters._fields)}
     values |= {name: rows[ROWS[name]] for name in ("log_posterior", "log_evidence", "chi_square")}
     for name in model.dropped:
@@ -154,16 +176,51 @@ def fit_part(known: Scene, prepared: Prepared, chosen: np.ndarray, earlier: Para
     if prepared.sigma_unknown:
         _add_search(model, frame.statistics, values, covariance, prepared.most[chosen])
     part = Part(values, covariance, status)
-    lost = np.flatnonzero(solved.lost | ~usable)
-    size = chunk_size(model)
-    for begin in range(0, len(lost), size):
-        some = lost[begin : begin + size]
-        told = None if earlier is None else Parameters(*(x[some] for x in earlier))
-        found = fit_chunk(prepared, chosen[some], told, DESIGN if told is None else DESIGN_WARM)
-        for name, value in found.values.items():
-            part.values[name][some] = value
-        part.covariance[some], part.status[some] = found.covariance, found.status
+
+    def replace_by(found: Part, where: np.ndarray) -> None:
+        with np.errstate(over="ignore"):
+            for name, value in found.values.items():
+                values[name][where] = value
+        covariance[where], status[where] = found.covariance, found.status
+        status[where] |= _overflowed(values["log_posterior"][where])
+
+    def told(where: np.ndarray) -> Parameters | None:
+        return None if earlier is None else Parameters(*(x[where] for x in earlier))
+
+    lost, single = np.flatnonzero(solved.lost & usable), frame.dtype == np.float32
+    if len(lost) and single:
+        precise = Statistics(*(x[lost].astype(np.result_type(x, np.float64)) for x in statistics))
+        with double_precision():
+            replace_by(_fit_statistics(known, prepared, chosen[lost], precise, told(lost)), lost)
+        status |= np.where(on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
+    lost = np.flatnonzero(~usable if single else solved.lost | ~usable)
+    if len(lost):
+        replace_by(_fit_general(prepared, chosen[lost], told(lost), frame.dtype), lost)
     return part
+
+
+def _overflowed(log_posterior: np.ndarray) -> np.ndarray:
+    """Status bit of densities that the precision of the result cannot hold."""
+    return np.where(np.isfinite(log_posterior), np.int32(0), np.int32(Status.NOT_CONVERGED))
+
+
+def _fit_general(prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None, dtype: np.dtype) -> Part:
+    """Pixels that the general route has to take: in double precision, results in that of ``dtype``."""
+    size, parts, model = chunk_size(prepared.model), [], prepared.model
+    with double_precision():
+        for begin in range(0, len(chosen), size):
+            some = slice(begin, begin + size)
+            told = None if earlier is None else Parameters(*(x[some] for x in earlier))
+            design = DESIGN if told is None else DESIGN_WARM
+            parts.append(fit_chunk(prepared, chosen[some], told, design, np.dtype(np.complex128)))
+    values = {name: np.concatenate([part.values[name] for part in parts]) for name in parts[0].values}
+    with np.errstate(over="ignore"):
+        for name, value in values.items():
+            values[name] = value.astype(np.result_type(dtype, np.complex64) if np.iscomplexobj(value) else dtype)
+    status = np.concatenate([part.status for part in parts]) | _overflowed(values["log_posterior"])
+    found = np.stack([values[name] for name in Parameters._fields])
+    status |= np.where(on_bounds(model, found), np.int32(Status.AT_EDGE), np.int32(0))
+    return Part(values, np.concatenate([part.covariance for part in parts]).astype(dtype), status)
 
 
 def _add_search(
@@ -211,7 +268,7 @@ def fit_responses(
         known_start = Parameters(*(np.asarray(x) if good is None else np.asarray(x)[good] for x in earlier))
     with bar(frame.pixels, progress) as done:
         solved = solve(known, frame, known_start, done)
-    rows, status = solved.rows, status_of(model, solved.rows, solved.edge)
+    rows, status = solved.rows, status_of(model, solved)
     degrees = max(2 * int(frame.shared.count) - len(model.free) - model.known_gain.real_parameters, 0)
     if degrees:
         worst = 2 * gammainccinv(0.5 * degrees, BAD_FIT_PROBABILITY)
@@ -228,7 +285,7 @@ def _fill_in(
     general: Callable[[Model, Measurement, Parameters | None, bool], Fit],
     rows: np.ndarray, status: np.ndarray, lost: np.ndarray, place: np.ndarray, used: np.ndarray,
 ) -> None:  # fmt: skip
-    """Pixels without a finite response, and those that the general route has to take."""
+    """Pixels without a finite response, those that single precision cannot settle, and the general route's."""
     shape, n = measurement.shape, measurement.states
     response = measurement.response.reshape(-1, 2, n)[place]
     finite = np.isfinite(response[:, :, used]).all(axis=(-1, -2))
@@ -238,20 +295,25 @@ def _fill_in(
         return
     sigma = measurement.sigma
     part = Measurement(
-        measurement.illumination.reshape(2, n),
-        response,
+        measurement.illumination.reshape(2, n).astype(np.complex128),
+        response.astype(np.complex128),
         sigma if sigma is None or sigma.size == 1 else np.broadcast_to(sigma, shape).reshape(-1)[place],
         None if measurement.weight is None else measurement.weight.reshape(n),
     )
-    found = general(model, part, None if earlier is None else Parameters(*(x[lost] for x in earlier)), False)
+    told = None if earlier is None else Parameters(*(x[lost] for x in earlier))
+    with double_precision():
+        found = fit_responses(model, part, told, False, general) if rows.dtype == np.float32 else None
+        found = general(model, part, told, False) if found is None else found
     rows[ROWS["parameters"], lost] = np.stack(list(found.parameters))
     rows[ROWS["std"], lost] = np.stack(list(found.std))
     rows[ROWS["covariance"], lost] = found.covariance.reshape(-1, 25).T
-    for name in ("log_posterior", "log_evidence", "chi_square"):
-        rows[ROWS[name], lost] = getattr(found, name)
-    if found.gain is not None:
-        rows[ROWS["gain_real"], lost], rows[ROWS["gain_imaginary"], lost] = found.gain.real, found.gain.imag
-    status[lost] = found.status
+    with np.errstate(over="ignore"):
+        for name in ("log_posterior", "log_evidence", "chi_square"):
+            rows[ROWS[name], lost] = getattr(found, name)
+        if found.gain is not None:
+            rows[ROWS["gain_real"], lost], rows[ROWS["gain_imaginary"], lost] = found.gain.real, found.gain.imag
+    status[lost] = found.status | _overflowed(rows[ROWS["log_posterior"], lost])
+    status |= np.where(on_bounds(model, rows), np.int32(Status.AT_EDGE), np.int32(0))
 
 
 def _as_fit(

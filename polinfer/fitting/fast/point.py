@@ -59,10 +59,15 @@ def rotate(pair: Pair, step: Any) -> Pair:
 
 
 def sine_of_double(pair: Pair) -> Any:
-    """``2 cos y sin y``, next to 1 and -1 to within rounding of the result, not of its square root."""
+    """``2 cos y sin y``, next to 1 and -1 to within rounding of the result, not of its square root.
+
+    J depends on ``sqrt(1 - |D|)``: what is nearer to the number next to 1 in this than to 1 is rounded to it.
+    """
     c, s = pair
     cosine = (c - s) * (c + s)
     away = cosine * cosine / (1 + jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0)))
+    next_to_one = 0.5 * jnp.finfo(c.dtype).eps
+    away = jnp.where((away > 0.25 * next_to_one) & (away < next_to_one), next_to_one, away)
     return jnp.where(jnp.abs(cosine) < 0.5, jnp.sign(s) * (1 - away), 2 * c * s)
 
 
