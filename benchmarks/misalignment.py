@@ -1,9 +1,10 @@
 """Is a tilt between the arms found as well as it can be, and what does it cost?
 
-A retarder near half a wave, turned, under a phase plane of the second arm, 64 x 64 pixels, three balanced states: errors
-of retardance, of its angle and of the slopes against the Cramer-Rao bounds with the tilt unknown, with ``TiltPlane``,
-``RotatedBasis`` (window 3 x 5) and no correction. Errors are those from the nearest of the eight equivalent truths and of
-the two branches of the piston. Then angles at which nothing can be known; an edge; and the time beside a plain fit.
+A retarder near half a wave, turned, under a phase plane of the second arm, 64 x 64 pixels, three balanced states:
+errors of retardance, of its angle and of the slopes against the Cramer-Rao bounds with the tilt unknown, with
+``TiltPlane``, ``RotatedBasis`` (window 3 x 5) and no correction. Errors are those from the nearest of the eight
+equivalent truths and of the two branches of the piston. Then angles at which nothing can be known; an edge; and the
+time beside a plain fit.
 """
 
 from __future__ import annotations

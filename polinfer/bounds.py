@@ -39,12 +39,12 @@ def _jacobian(model: Model, points: jax.Array, illumination: jax.Array) -> jax.A
 
 
 class _Information(NamedTuple):
-    """Of every pixel: the inverse of its Fisher information as ``axes inverse^2 axes^T sigma^2 / 2``, what the data leave
-    open, and the derivatives of the data by the phase in the same terms.
+    """Of every pixel: the inverse of its Fisher information as ``axes inverse^2 axes^T sigma^2 / 2``, what the data
+    leave open, and the derivatives of the data by the phase in the same terms.
 
     ``axes`` and ``inverse`` (pixels, directions, unknowns) and (pixels, directions); ``missing`` (pixels, unknowns);
-    ``follow`` (pixels, unknowns) is how the unknowns would have to change with the phase, and ``rest`` (pixels) the square
-    of what is left of the phase's derivative. In place of D the unknown is delta, D = sin delta.
+    ``follow`` (pixels, unknowns) is how the unknowns would have to change with the phase, and ``rest`` (pixels) the
+    square of what is left of the phase's derivative. In place of D the unknown is delta, D = sin delta.
     """
 
     shape: tuple[int, ...]
@@ -121,8 +121,8 @@ def cramer_rao_bound(
     ``F_ij = (2 / sigma^2) Re <d(g J U)/dp_i, d(g J U)/dp_j>``; an unknown gain is part of p, taken at g = 1
     (for another amplitude divide sigma by it). Priors do not enter.
 
-    With a :class:`TiltPlane` the coefficients of the plane are unknowns of the whole frame, and the parameters are those
-    of all its pixels (last two axes of P).
+    With a :class:`TiltPlane` the coefficients of the plane are unknowns of the whole frame, and the parameters are
+    those of all its pixels (last two axes of P).
 
     Parameters
     ----------

@@ -230,12 +230,13 @@ class Model:
         ``-|g J U - V|^2 / sigma^2 - 2 n log(pi sigma^2)`` for known g and sigma. With neighbours it is that of all data
         of the window around each pixel. NaN in masked pixels and where the response is not finite.
 
-        ``tilt`` is the phase phi of the second arm, radians, broadcasts to P: the density of the data is then that of the
-        matrix ``T^-1 J T``, ``T = diag(1, e^{i phi})``. A model with :class:`TiltPlane` needs it.
+        ``tilt`` is the phase phi of the second arm, radians, broadcasts to P: the density of the data is then that of
+        the matrix ``T^-1 J T``, ``T = diag(1, e^{i phi})``. A model with :class:`TiltPlane` needs it.
 
         Raises
         ------
-        ValueError: the measurement has no sigma, or has one that is to be inferred (see :class:`InferredNoise`); no tilt.
+        ValueError: the measurement has no sigma, or has one that is to be inferred (see :class:`InferredNoise`); no
+            tilt.
 
         >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
         >>> round(float(Model().log_likelihood(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)

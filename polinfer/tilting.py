@@ -55,8 +55,8 @@ def tilted_statistics(statistics: Statistics, phase: np.ndarray) -> Statistics:
 def untilt(measurement: Measurement, tilt: Any) -> Measurement:
     """The measurement of the same sample without the tilt.
 
-    Of ``V = g T^-1 J T U + noise`` with ``T = diag(1, e^{i phi})`` it is ``T V = g J (T U) + noise'``, where the noise is
-    as before, because T is unitary. Where all pixels share balanced states (``U U^H`` proportional to 1) the
+    Of ``V = g T^-1 J T U + noise`` with ``T = diag(1, e^{i phi})`` it is ``T V = g J (T U) + noise'``, where the noise
+    is as before, because T is unitary. Where all pixels share balanced states (``U U^H`` proportional to 1) the
     illumination stays what it was: with ``Jhat = V U^H / s_0``, ``V' = T (V + (Jhat T^-1 - Jhat) U)`` has the same
     residual for every J. (The noise of single states is then mixed: do not leave one out afterwards.)
 

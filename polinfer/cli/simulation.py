@@ -94,12 +94,11 @@ def simulate_command(
     assert seed is not None
     scene = phantoms.lesion(shape, rng=seed)
     factor = {"none": np.ones(shape, complex), "phase": scene.gain / np.abs(scene.gain), "complex": scene.gain}[gain]
-    scene = replace(scene, gain=factor)
+    scene = replace(scene, gain=factor, tilt=None if tilt is None else TiltPlane().phase(np.radians(tilt), shape))
     if jones:
         illumination = np.eye(2, dtype=complex)
     else:
         illumination = np.stack([np.ones(states), np.exp(2j * np.pi * np.arange(states) / states)]) / np.sqrt(2)
-    phase = None if tilt is None else TiltPlane().phase(np.radians(tilt), shape)
     # with one seed for both, the noise would repeat the draws of which the scene is made
     data = simulate(
         Model(named_ordering(ordering)),
@@ -108,7 +107,7 @@ def simulate_command(
         sigma,
         rng=seed + 1,
         gain=scene.gain,
-        tilt=phase,
+        tilt=scene.tilt,
     )
     storage.save(data, out, overwrite=overwrite)
     if truth is not None:

@@ -1,9 +1,10 @@
 """The verb ``fit`` for a model with a :class:`polinfer.TiltPlane`: the plane and all pixels together.
 
 With the pixels' parameters eliminated the log posterior of the coefficients is a sum over pixels,
-``sum_i F_i(phi_i) + log p(tilt)``, ``F_i = log sum_copies max exp f_i``. Its Newton steps cost one pass over the pixels.
-The start is a peak of the spectrum of ``conj(J_01) J_10``; what the pixels say about the phase once they are fitted gives
-the spectrum of everything they know, hence whether another plane is better, and how much of the posterior lies elsewhere.
+``sum_i F_i(phi_i) + log p(tilt)``, ``F_i = log sum_copies max exp f_i``. Its Newton steps cost one pass over the
+pixels. The start is a peak of the spectrum of ``conj(J_01) J_10``; what the pixels say about the phase once they are
+fitted gives the spectrum of everything they know, hence whether another plane is better, and how much of the posterior
+lies elsewhere.
 """
 
 from __future__ import annotations
@@ -243,7 +244,7 @@ def _first(plane: TiltPlane, phasors: np.ndarray) -> np.ndarray:
 
 
 def _better(plane: TiltPlane, pixels: Pixels, tried: list[_Place]) -> np.ndarray | None:
-    """A plane away from those that were tried, which by what the pixels say has a higher posterior; None: there is none."""
+    """A plane away from those tried that by what the pixels say has a higher posterior; None: there is none."""
     place = tried[-1]
     spectrum = place.spectrum
     assert spectrum is not None
@@ -265,7 +266,7 @@ def _better(plane: TiltPlane, pixels: Pixels, tried: list[_Place]) -> np.ndarray
 def _climb(
     plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, index: np.ndarray | None, steps: int, enough: float
 ) -> _Place:
-    """Newton steps uphill with the pixels ``index``, the last of which is taken if its decrement is below ``enough``."""
+    """Newton steps uphill with the pixels ``index``; one with a decrement below ``enough`` is the last."""
     best: _Place | None = None
     trial, previous = coefficients, None
     for _ in range(steps):

@@ -25,8 +25,8 @@ WINDOWS = (0.25, 0.5, 0.75)  # sides of central parts of the frame, over which a
 class Spectrum(NamedTuple):
     """``|sum Z e^{-2 i (a v + b u)}|`` on a grid of slopes, twice as fine as it need be.
 
-    ``rows`` and ``columns`` are the slopes, radians from edge to edge; ``size`` (rows, columns). ``cell`` is the area of a
-    cell of the grid in which a slope that has no meaning (one row) does not count.
+    ``rows`` and ``columns`` are the slopes, radians from edge to edge; ``size`` (rows, columns). ``cell`` is the area
+    of a cell of the grid in which a slope that has no meaning (one row) does not count.
     """
 
     rows: np.ndarray

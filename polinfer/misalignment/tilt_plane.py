@@ -97,6 +97,9 @@ class TiltPlane(Misalignment):
 class Tilt:
     """The tilt that a fit found: :attr:`polinfer.Fit.tilt`.
 
+    Where no plane stands out of the noise (``Status.TILT_UNIDENTIFIED``) the coefficients are 0, and as uncertain as
+    before the data.
+
     Attributes
     ----------
     phase: the most probable phi at every pixel, shape P, radians, also where the pixel itself has no answer.
@@ -104,9 +107,10 @@ class Tilt:
     coefficients: ``(*frames, terms)``: piston in (-pi/2, pi/2], slopes along rows and columns, radians from edge to
         edge, higher terms as :attr:`TiltPlane.terms` lists them.
     covariance: ``(*frames, terms, terms)``, of the coefficients, the pixels' parameters integrated out.
-    probability: ``(*frames)``, share of this maximum in the posterior of the tilt. Low where noise makes as good planes.
-    log_evidence: ``(*frames)``, what the tilt adds to the log evidence of the frame given the tilt (nats); negative: the
-        price of the coefficients. It is part of :attr:`polinfer.Fit.log_evidence`, in equal shares of the pixels.
+    probability: ``(*frames)``, share of this maximum in the posterior of the tilt. Low where noise makes as good
+        planes.
+    log_evidence: ``(*frames)``, what the tilt adds to the log evidence of the frame given the tilt (nats); negative:
+        the price of the coefficients. It is part of :attr:`polinfer.Fit.log_evidence`, in equal shares of the pixels.
     response: ``(*P, 5)``, by how much the most probable parameters of a pixel change with phi, per radian.
     """
 

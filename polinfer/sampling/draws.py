@@ -39,8 +39,8 @@ class Draws:
     gain: draws of the complex gain of the pixel, ``(chain, draw, *P)``, None if the model has none.
     sigma: draws of sigma where it is inferred, ``(chain, draw, *P)``, else None.
     seed: seed of the generator. sampler: settings of the sampler.
-    tilt: draws of the tilt's coefficients ``(chain, draw, *frames, terms)``, each shared by the pixels of its frame, None
-        if the model has no :class:`polinfer.TiltPlane`; ``model.misalignment.phase(tilt, shape)`` are the phases.
+    tilt: draws of the tilt's coefficients ``(chain, draw, *frames, terms)``, each shared by the pixels of its frame,
+        None if the model has no :class:`polinfer.TiltPlane`; ``model.misalignment.phase(tilt, shape)`` are the phases.
 
     Raises
     ------

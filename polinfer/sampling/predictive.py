@@ -161,7 +161,7 @@ def predict(draws: Draws, rng: int | np.random.Generator | None, count: int, res
 
 
 def _device(draws: Draws, used: np.ndarray, pixels: np.ndarray) -> tuple[Parameters, jax.Array, jax.Array | None]:
-    """Parameters, gain and the phase of the tilt ``(draw, pixel)`` as JAX arrays in the precision of the measurement."""
+    """Parameters, gain and phase of the tilt ``(draw, pixel)`` as JAX arrays in the measurement's precision."""
     complex_type = jax.dtypes.canonicalize_dtype(draws.measurement.response.dtype)
     real_type = np.zeros((), complex_type).real.dtype
     parameters = Parameters(*(jnp.asarray(_chosen(x, used, pixels).astype(real_type)) for x in draws.parameters))

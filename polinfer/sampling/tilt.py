@@ -1,9 +1,9 @@
 """Draws of the tilt of a frame, and the pixels' draws moved along with it.
 
-A pixel's draws are made for the most probable tilt. Those of the tilt come from the Gaussian of its posterior, the pixels
-integrated out (:attr:`polinfer.Fit.tilt`), one for each draw, the same for all pixels of the frame. To it every pixel is
-moved as its most probable parameters move, ``parameters + response (phi - phi_found)``: to first order the joint
-posterior of tilt and pixels, and exact in what matters most, ``xi - phi`` of a retarder.
+A pixel's draws are made for the most probable tilt. Those of the tilt come from the Gaussian of its posterior, the
+pixels integrated out (:attr:`polinfer.Fit.tilt`), one for each draw, the same for all pixels of the frame. To it every
+pixel is moved as its most probable parameters move, ``parameters + response (phi - phi_found)``: to first order the
+joint posterior of tilt and pixels, and exact in what matters most, ``xi - phi`` of a retarder.
 """
 
 from __future__ import annotations

@@ -109,7 +109,8 @@ def test_bounds_are_those_of_the_whole_frame_at_once():
 def test_without_a_diattenuator_only_the_circularity_has_no_bound():
     truth = plate((4, 5), 0.0)
     bound, plain = (cramer_rao_bound(model, truth, BALANCED, 0.03) for model in (TILTED, Model()))
-    assert np.all(np.isinf(bound.circularity)) and np.all(np.isinf(tilt_bound(TILTED, truth, BALANCED, 0.03)))
+    assert np.all(np.isinf(bound.circularity))
+    assert np.all(np.isinf(tilt_bound(TILTED, truth, BALANCED, 0.03)))
     np.testing.assert_allclose(bound.retardance, plain.retardance)
     np.testing.assert_allclose(bound.retardance_angle, plain.retardance_angle)
     with pytest.raises(ValueError, match="tilt"):
@@ -152,7 +153,8 @@ def test_the_command_line_simulates_and_fits_a_tilt(tmp_path):
         (("--tilt-scale", "3"), "only for --tilt plane"),
     ):
         refused = run("fit", data, tmp_path / "other.nc", *options)
-        assert refused.exit_code == 2 and message in refused.output
+        assert refused.exit_code == 2
+        assert message in refused.output
 
 
 def test_a_measurement_of_one_shape_and_a_tilt_of_another():

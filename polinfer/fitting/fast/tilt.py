@@ -235,8 +235,8 @@ def phase_responses(
 ) -> Response:  # fmt: skip
     """What pixels ``(pixels)`` with statistics of their own say about the phase, at ``phase`` (pixels).
 
-    ``start``: points ``(10, pixels)`` and by how much the phase has changed since, parameters ``(5, pixels)``, from which
-    no change to an equivalent set is made, or None: the closed form.
+    ``start``: points ``(10, pixels)`` and by how much the phase has changed since, parameters ``(5, pixels)``, from
+    which no change to an equivalent set is made, or None: the closed form.
     """
     pixels, dtype = len(statistics.residual), statistics.residual.dtype
     size = BLOCKS[0] if pixels <= BLOCKS[0] else BLOCKS[1]
