@@ -67,7 +67,10 @@ def _frame_of(measurement: Measurement, index: tuple[int, ...]) -> Measurement:
         tail = values.shape[values.ndim - trailing :]
         return np.asarray(np.broadcast_to(values, shape + tail)[index])
 
-    chosen = {"illumination": part(measurement.illumination, 2), "response": part(measurement.response, 2)}
+    chosen: dict[str, Any] = {
+        "illumination": part(measurement.illumination, 2),
+        "response": part(measurement.response, 2),
+    }
     chosen |= {"sigma": part(measurement.sigma, 0), "weight": part(measurement.weight, 1)}
     mask = part(measurement.mask, 0)
     if mask is not None and not mask.any():
@@ -84,7 +87,7 @@ def _map(function: Callable[..., Any], *records: Any) -> Any:
     if isinstance(first, np.ndarray):
         return function(*records)
     if isinstance(first, tuple):
-        return type(first)(*(_map(function, *parts) for parts in zip(*records, strict=True)))  # type: ignore[call-arg]
+        return type(first)(*(_map(function, *parts) for parts in zip(*records, strict=True)))
     values = {f.name: _map(function, *(getattr(r, f.name) for r in records)) for f in fields(first)}
     return type(first)(**values)
 
@@ -197,7 +200,7 @@ class _Place(NamedTuple):
 
 def _at(plane: TiltPlane, pixels: Pixels, coefficients: np.ndarray, said: Any) -> _Place:
     """Sums over the pixels; their number is that of what they said."""
-    basis = pixels.basis if len(said.index) == pixels.count else pixels.basis[:, said.index]
+    basis = pixels.basis if len(said.chosen) == pixels.count else pixels.basis[:, said.chosen]
     gradient, curvature = basis @ said.slope, -(basis * said.bend) @ basis.T
     precision = np.full(len(coefficients), plane.scale**-2.0)
     precision[0] = 0

@@ -27,12 +27,12 @@ GENERAL = 1024  # pixels that the general route is asked about before the last p
 
 
 class Said(NamedTuple):
-    """Of the pixels ``index``: log density, its derivatives by the phase, at which phase, and the parameters' ones.
+    """Of the pixels ``chosen``: log density, its derivatives by the phase, at which phase, and the parameters' ones.
 
     ``follow`` is ``(5, pixels)``, per radian; ``points`` is where the pixels are, for the next call.
     """
 
-    index: np.ndarray
+    chosen: np.ndarray
     phase: np.ndarray
     value: np.ndarray
     slope: np.ndarray
