@@ -17,6 +17,7 @@ ALL = (
     "parts",
     "hard_cases",
     "ordering",
+    "misalignment",
     "posterior",
     "calibration",
     "texture",

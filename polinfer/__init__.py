@@ -1,7 +1,7 @@
 """Bayesian inference of polarisation parameters from Jones-matrix data."""
 
 from . import contrast, conventions, datasets, phantoms, texture
-from .bounds import cramer_rao_bound
+from .bounds import cramer_rao_bound, tilt_bound
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
@@ -9,6 +9,7 @@ from .files import load
 from .fitting import fit
 from .gain import ComplexGain, PhaseGain
 from .gauge import smooth_gauge
+from .misalignment import RotatedBasis, TiltPlane
 from .model import Model
 from .neighbours import Window
 from .noise import InferredNoise, KnownNoise
@@ -18,6 +19,7 @@ from .records import Fit, Measurement, Parameters, Status
 from .sampling import Draws, Ensemble, Gibbs, calibration_ranks, sample, summarise
 from .simulation import simulate
 from .storage import save
+from .tilting import untilt
 
 __all__ = [
     "AxialVonMises",
@@ -37,7 +39,9 @@ __all__ = [
     "PolariserFirst",
     "Prior",
     "RetarderFirst",
+    "RotatedBasis",
     "Status",
+    "TiltPlane",
     "TruncatedNormal",
     "UniformAngle",
     "VonMises",
@@ -64,4 +68,6 @@ __all__ = [
     "smooth_gauge",
     "summarise",
     "texture",
+    "tilt_bound",
+    "untilt",
 ]

@@ -8,6 +8,7 @@ from typing import Any
 from . import storage
 from .datasets import FibreMatrix
 from .gain import ComplexGain, PhaseGain
+from .misalignment import RotatedBasis, Tilt, TiltPlane
 from .model import Model
 from .neighbours import Window
 from .noise import InferredNoise, KnownNoise
@@ -32,6 +33,7 @@ TYPES: tuple[type, ...] = (
     VonMises, AxialVonMises, UniformAngle, TruncatedNormal,
     Texture, FitTexture, Angle, Bounded, Chi, Rescaled,
     KnownNoise, InferredNoise, PhaseGain, ComplexGain, Window,
+    TiltPlane, RotatedBasis, Tilt,
 )  # fmt: skip
 
 

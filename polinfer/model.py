@@ -17,12 +17,14 @@ from .checks import one_of_types, real_number
 from .circular import wrap
 from .elements import multiply
 from .gain import Gain, UnitGain
+from .misalignment import Misalignment, RotatedBasis, TiltPlane
 from .neighbours import Pooled, Window, Windowed, pool
 from .noise import KnownNoise, Noise
 from .orderings import Ordering, RetarderFirst
 from .priors import Prior, default_priors
 from .records import PERIODS, RANGES, Measurement, Parameters
 from .statistics import Statistics, Summary, summarise
+from .tilting import tilt_of, tilted_statistics
 
 __all__ = ["Model"]
 
@@ -76,6 +78,8 @@ class Model:
     noise: :class:`KnownNoise` or :class:`InferredNoise`.
     gain: :class:`PhaseGain`, :class:`ComplexGain`, or None: g = 1.
     neighbours: :class:`Window` whose pixels share the parameters (a gain remains one for each pixel), or None.
+    misalignment: :class:`TiltPlane`, :class:`RotatedBasis` (needs neighbours, and has no circularity), or None: the two
+        arms of the illumination are parallel.
     fixed: dict of known values by parameter name. A parameter that then drops out of J is integrated out: with
         ``diattenuation`` 0 its angle; with ``retardance`` 0 its angle and the circularity; with ``retardance_angle``
         0 or pi/2 the circularity.
@@ -99,6 +103,7 @@ class Model:
     noise: Noise = KnownNoise()
     gain: Gain | None = None
     neighbours: Window | None = None
+    misalignment: Misalignment | None = None
     fixed: Any = None
 
     def __post_init__(self) -> None:
@@ -109,6 +114,12 @@ class Model:
         if self.neighbours is not None:
             one_of_types("neighbours", self.neighbours, (Window,), "pass Window(rows, columns) or None.")
         fixed = _known_names("fixed", self.fixed)
+        if self.misalignment is not None:
+            kinds = (TiltPlane, RotatedBasis)
+            one_of_types("misalignment", self.misalignment, kinds, "pass TiltPlane(), RotatedBasis() or None.")
+        if isinstance(self.misalignment, RotatedBasis):
+            self._check_rotated_basis(fixed)
+            fixed = fixed | {"circularity": 0.0}
         for name, value in fixed.items():
             low, high = getattr(RANGES, name)
             fixed[name] = real_number(f"fixed[{name!r}]", value, low=low, high=high)
@@ -134,6 +145,19 @@ class Model:
             raise TypeError(
                 f"priors, ordering and gain must be hashable ({error}); declare yours with @dataclass(frozen=True)."
             ) from None
+
+    def _check_rotated_basis(self, fixed: dict[str, Any]) -> None:
+        if self.neighbours is None:
+            raise ValueError(
+                "misalignment is RotatedBasis() without neighbours: the angle of the basis is that of a window; pass "
+                "neighbours=Window(3, 5)."
+            )
+        known, prior = fixed.get("circularity", 0), _known_names("priors", self.priors).get("circularity")
+        if known != 0 or prior is not None:
+            given = f"fixed['circularity'] = {known}" if known != 0 else f"priors['circularity'] = {prior}"
+            raise ValueError(
+                f"misalignment is RotatedBasis(), a model without circularity, and {given}; leave that out."
+            )
 
     @property
     def dropped(self) -> frozenset[str]:
@@ -200,36 +224,49 @@ class Model:
                 total = total + self.priors[name].log_density(wrap(value, getattr(PERIODS, name)))
         return jnp.asarray(total)
 
-    def log_likelihood(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
+    def log_likelihood(self, parameters: Parameters, measurement: Measurement, tilt: Any = None) -> jax.Array:
         """Log density of the data, gain and noise integrated out (nats); shape P broadcast with that of the parameters.
 
         ``-|g J U - V|^2 / sigma^2 - 2 n log(pi sigma^2)`` for known g and sigma. With neighbours it is that of all data
         of the window around each pixel. NaN in masked pixels and where the response is not finite.
 
+        ``tilt`` is the phase phi of the second arm, radians, broadcasts to P: the density of the data is then that of
+        the matrix ``T^-1 J T``, ``T = diag(1, e^{i phi})``. A model with :class:`TiltPlane` needs it.
+
         Raises
         ------
-        ValueError: the measurement has no sigma, or has one that is to be inferred (see :class:`InferredNoise`).
+        ValueError: the measurement has no sigma, or has one that is to be inferred (see :class:`InferredNoise`); no
+            tilt.
 
         >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
         >>> round(float(Model().log_likelihood(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
         -4.5789
         """
-        return self._evaluate(_log_data, parameters, measurement)
+        return self._evaluate(_log_data, parameters, measurement, tilt)
 
-    def log_posterior(self, parameters: Parameters, measurement: Measurement) -> jax.Array:
+    def log_posterior(self, parameters: Parameters, measurement: Measurement, tilt: Any = None) -> jax.Array:
         """``log_likelihood + log_prior``: normalised as a density of data and parameters, not over the evidence.
+
+        Given the ``tilt``, whose own prior is left out (:meth:`TiltPlane.log_prior`).
 
         >>> m = Measurement(np.eye(2), np.eye(2), sigma=1.0)
         >>> round(float(Model().log_posterior(Parameters(0.0, 0.0, 0.0, 0.0, 0.0), m)), 4)
         -9.9593
         """
-        return self._evaluate(_log_density, parameters, measurement)
+        return self._evaluate(_log_density, parameters, measurement, tilt)
 
-    def _evaluate(self, function: Any, parameters: Parameters, measurement: Measurement) -> jax.Array:
+    def _evaluate(self, function: Any, parameters: Parameters, measurement: Measurement, tilt: Any) -> jax.Array:
         one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
         one_of_types("measurement", measurement, (Measurement,), "pass a Measurement.")
         given = Parameters(*(jnp.asarray(value) for value in parameters))
         summary, dtype = summarise(measurement, self.noise.sigma(measurement)), measurement.response.dtype
+        if tilt is not None:
+            phase = tilt_of(tilt, measurement.shape)
+            summary = summary._replace(statistics=tilted_statistics(summary.statistics, phase))
+        elif isinstance(self.misalignment, TiltPlane):
+            raise ValueError(
+                "tilt is None and the model has a TiltPlane; pass the phases, such as tilt=fit.tilt.phase."
+            )
         if self.neighbours is None:
             values = function(self, given, as_device(summary.statistics, dtype))
         else:

@@ -162,6 +162,16 @@ def _draw_parameters(
     return grey
 
 
+def _draw_tilt(axes: np.ndarray, fit: Fit, pixel_size: float | None) -> None:
+    """The phase between the arms above its standard deviation, grey where it is not known; it has no holes."""
+    assert fit.tilt is not None
+    unknown = (np.asarray(fit.status) & int(Status.TILT_UNIDENTIFIED)) != 0
+    known = np.zeros(np.shape(unknown), bool)
+    phase, width = np.degrees(fit.tilt.phase), np.degrees(fit.tilt.phase_std)
+    draw_map(axes[0], "tilt (°)", phase, known, unknown=unknown, pixel_size=pixel_size)
+    draw_map(axes[1], "± standard deviation (°)", width, known, high=np.inf, pixel_size=pixel_size)
+
+
 def explain(figure: Figure, grey: bool, hatched: bool, smooth: bool) -> None:
     """What grey and hatched pixels mean, and which gauge it is."""
     from matplotlib.patches import Patch
@@ -205,7 +215,7 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
         pixel_size = real_number("pixel_size", pixel_size, above=0)
     status = np.asarray(fit.status)
     lost = (status & _NO_ANSWER) != 0
-    extra = 1 if fit.gain is None else 2
+    extra = (1 if fit.gain is None else 2) + (fit.tilt is not None)
     figure, axes = two_rows(status, 5 + extra, pixel_size)
     quality = axes[1] if fit.gain is not None else axes[:, 0]
     if fit.gain is not None:
@@ -215,6 +225,8 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
     draw_map(quality[0], "χ² / degrees of freedom", fit.chi_square / np.maximum(freedom, 1), lost | (freedom == 0),
           high=np.inf, pixel_size=pixel_size)  # fmt: skip
     draw_map(quality[1], "log evidence (nat)", fit.log_evidence, lost, pixel_size=pixel_size)
+    if fit.tilt is not None:
+        _draw_tilt(axes[:, extra - 1], fit, pixel_size)
     parameters = smooth_gauge(fit.parameters, status) if smooth else fit.parameters
     grey = _draw_parameters(axes[:, extra:], parameters, fit.std, status, pixel_size)
     explain(figure, grey, bool(lost.any()), smooth)

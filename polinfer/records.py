@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from . import checks, storage
+from .misalignment import Tilt
 from .storage import array
 
 if TYPE_CHECKING:
@@ -187,6 +188,9 @@ class Fit:
         :class:`Parameters`; rows of fixed and dropped parameters are 0.
     log_posterior: log likelihood plus log prior at the maximum, nuisances marginalised, normalised (nats).
     log_evidence: Laplace approximation, summed over all equivalent parameter sets (nats).
+    tilt: :class:`polinfer.misalignment.Tilt`, the phase between the arms and its uncertainty, None if the model has no
+        :class:`TiltPlane`. With one, parameters and log_posterior are given its most probable value; std and covariance
+        take its uncertainty in, and log_evidence has its price, in equal shares of the pixels of a frame.
     sigma: noise used. gain: posterior mean of the complex gain at the maximum, None if the model has none.
     status: :class:`Status` bits. chi_square: ``2 |residual|^2 / sigma^2`` at the maximum, to be compared with
     degrees_of_freedom: real data less fitted parameters and gain, at least 0. Where sigma was inferred it is
@@ -206,6 +210,7 @@ class Fit:
     chi_square: np.ndarray = array(("*P",), "1")
     degrees_of_freedom: np.ndarray = array(("*P",), "1")
     started_from_fit: bool = False
+    tilt: Tilt | None = None
 
     def interval(self, level: float) -> tuple[Parameters, Parameters]:
         """Central interval of the local Gaussian that holds probability ``level`` (0 < level < 1).

@@ -22,6 +22,26 @@ def _middle(values: Any, period: float) -> tuple[str, float]:
     return "circular mean", float(turn * np.angle(np.nanmean(np.exp(1j * np.asarray(values, float) / turn))))
 
 
+def _tell_tilt(tilt: Any) -> None:
+    """Piston and slopes of the first frames, degrees."""
+    import numpy as np
+
+    terms = tilt.coefficients.shape[-1]
+    frames = zip(
+        np.degrees(tilt.coefficients).reshape(-1, terms),
+        np.degrees(np.sqrt(np.diagonal(tilt.covariance, axis1=-2, axis2=-1))).reshape(-1, terms),
+        tilt.probability.reshape(-1),
+        strict=True,
+    )
+    for number, (value, width, probability) in enumerate(frames):
+        if number == 3:
+            click.echo(f"  tilt: and {tilt.probability.size - 3} frames more")
+            break
+        pairs = zip(("piston", "rows", "columns"), value, width, strict=False)
+        told = ", ".join(f"{name} {x:.4g} ± {s:.2g}" for name, x, s in pairs)
+        click.echo(f"  tilt: {told} degrees from edge to edge, probability {probability:.3g}")
+
+
 @click.command("fit")
 @click.argument("measurement", type=PATH)
 @click.argument("out", type=PATH)
@@ -52,6 +72,8 @@ def fit_command(
     Example: polinfer fit measurement.nc result.nc --gain complex --gain-scale 1.0 --picture map.png
 
     Example: polinfer fit measurement.nc result.nc --window 3 5 --fix diattenuation=0
+
+    Example: polinfer fit measurement.nc result.nc --tilt plane
     """
     import numpy as np
 
@@ -82,5 +104,7 @@ def fit_command(
             kind, middle = _middle(values, period)
             width = scale * float(np.nanmedian(widths))
             click.echo(f"  {name}: {kind} {scale * middle:.4g}, median standard deviation {width:.2g}{unit}")
+    if result.tilt is not None:
+        _tell_tilt(result.tilt)
     if declared["infer_noise"] is not None and np.isfinite(result.sigma).any():
         click.echo(f"  sigma: median {float(np.nanmedian(result.sigma)):.4g}")

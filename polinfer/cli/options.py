@@ -53,6 +53,18 @@ _MODEL = (
         help="The pixels of such a window share their parameters; odd numbers.",
     ),
     click.option(
+        "--tilt",
+        type=click.Choice(["none", "plane", "rotated-basis"]),
+        default="none",
+        show_default=True,
+        help="The two arms are out of line: a phase plane over the frame, or the published model (needs --window).",
+    ),
+    click.option(
+        "--tilt-scale",
+        type=float,
+        help="Standard deviation of the plane's slopes before the data, degrees from edge to edge.  [default: 1146]",
+    ),
+    click.option(
         "--infer-noise",
         type=click.Choice(["pixel", "frame"]),
         help="The noise is unknown, one sigma a pixel or a frame; a sigma in the file is not used.",
@@ -116,6 +128,8 @@ def declared_model(
     gain: str,
     gain_scale: float | None,
     window: tuple[int, int] | None,
+    tilt: str,
+    tilt_scale: float | None,
     infer_noise: str | None,
     noise_shape: float | None,
     noise_scale: float | None,
@@ -149,6 +163,20 @@ def declared_model(
         from .. import Window
 
         parts["neighbours"] = Window(*window)
+    if tilt_scale is not None and tilt != "plane":
+        raise click.UsageError("--tilt-scale is only for --tilt plane.")
+    if tilt == "plane":
+        from math import radians
+
+        from ..misalignment import TiltPlane
+
+        parts["misalignment"] = TiltPlane() if tilt_scale is None else TiltPlane(radians(tilt_scale))
+    elif tilt == "rotated-basis":
+        if window is None:
+            raise click.UsageError("--tilt rotated-basis needs --window ROWS COLUMNS, such as 3 5.")
+        from ..misalignment import RotatedBasis
+
+        parts["misalignment"] = RotatedBasis()
     return Model(named_ordering(ordering), gain=factor, fixed=_known_values(fix), **parts)
 
 

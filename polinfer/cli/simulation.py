@@ -40,6 +40,13 @@ __all__ = ["simulate_command"]
     help="Complex factor of every pixel: 1; the scene's phase; its amplitude, 0.6 to 1, and phase.",
 )
 @click.option(
+    "--tilt",
+    nargs=3,
+    type=float,
+    metavar="PISTON ROWS COLUMNS",
+    help="Phase plane between the two arms: at the centre, and from edge to edge, degrees.",
+)
+@click.option(
     "--seed",
     type=click.IntRange(min=0),
     show_default="drawn, and printed",
@@ -57,6 +64,7 @@ def simulate_command(
     jones: bool,
     ordering: str,
     gain: str,
+    tilt: tuple[float, float, float] | None,
     seed: int | None,
     truth: Path | None,
     overwrite: bool,
@@ -71,6 +79,7 @@ def simulate_command(
 
     from .. import phantoms, storage
     from ..checks import as_generator
+    from ..misalignment import TiltPlane
     from ..model import Model
     from ..simulation import simulate
 
@@ -85,14 +94,20 @@ def simulate_command(
     assert seed is not None
     scene = phantoms.lesion(shape, rng=seed)
     factor = {"none": np.ones(shape, complex), "phase": scene.gain / np.abs(scene.gain), "complex": scene.gain}[gain]
-    scene = replace(scene, gain=factor)
+    scene = replace(scene, gain=factor, tilt=None if tilt is None else TiltPlane().phase(np.radians(tilt), shape))
     if jones:
         illumination = np.eye(2, dtype=complex)
     else:
         illumination = np.stack([np.ones(states), np.exp(2j * np.pi * np.arange(states) / states)]) / np.sqrt(2)
     # with one seed for both, the noise would repeat the draws of which the scene is made
     data = simulate(
-        Model(named_ordering(ordering)), scene.parameters, illumination, sigma, rng=seed + 1, gain=scene.gain
+        Model(named_ordering(ordering)),
+        scene.parameters,
+        illumination,
+        sigma,
+        rng=seed + 1,
+        gain=scene.gain,
+        tilt=scene.tilt,
     )
     storage.save(data, out, overwrite=overwrite)
     if truth is not None:

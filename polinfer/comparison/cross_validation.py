@@ -10,6 +10,8 @@ from scipy.special import logsumexp
 
 from ..model import Model
 from ..records import Measurement, Parameters
+from ..sampling.tilt import phase_of
+from ..tilting import tilted
 from .pareto import smoothed_log_weights
 
 __all__ = ["LeaveOneOut", "leave_one_out"]
@@ -66,6 +68,7 @@ def leave_one_out(draws: Any) -> LeaveOneOut:
 
     parameters = {name: flat(getattr(draws.parameters, name)) for name in Parameters._fields}
     gain, sigma = (None if x is None else flat(x) for x in (draws.gain, draws.sigma))
+    tilt = None if draws.tilt is None else draws.tilt.reshape(count, *draws.tilt.shape[2:])
     drawn = [parameters[name] for name in model.free] + [x for x in (gain, sigma) if x is not None]
     known = np.all([np.isfinite(x[0]) for x in drawn], axis=0)
     good = np.flatnonzero(known)
@@ -75,6 +78,7 @@ def leave_one_out(draws: Any) -> LeaveOneOut:
         density = log_densities(
             model, measurement, Parameters(**{m: x[:, chosen] for m, x in parameters.items()}), chosen,
             None if gain is None else gain[:, chosen], None if sigma is None else sigma[:, chosen],
+            None if tilt is None else phase_of(model, tilt, shape, chosen),
         )  # fmt: skip
         ratios = np.moveaxis(-density, 0, -1)
         weights, k[chosen] = smoothed_log_weights(ratios)
@@ -89,6 +93,7 @@ def log_densities(
     pixels: np.ndarray,
     gain: np.ndarray | None,
     sigma: np.ndarray | None,
+    phase: np.ndarray | None,
 ) -> np.ndarray:
     """Log density of every state of the ``pixels`` (flat indices), ``(draws, pixels, n)``; 0 for missing states."""
     shape, n = measurement.shape, measurement.states
@@ -100,6 +105,8 @@ def log_densities(
         assert measurement.sigma is not None
         sigma = np.broadcast_to(measurement.sigma, shape).reshape(-1)[pixels]
     matrices = np.asarray(model.jones(parameters), complex)
+    if phase is not None:
+        matrices = tilted(matrices, phase)
     if gain is not None:
         matrices = gain[..., None, None] * matrices
     seen = weight > 0

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import one_of_types
+from ..misalignment import TiltPlane
 from ..model import Model
 from ..noise import InferredNoise, KnownNoise
 from ..records import Fit, Measurement, Parameters, Status
@@ -18,6 +19,7 @@ from .fast import fast_scene, fit_part, fit_responses, judge_states
 from .frame_noise import Search, first_guess
 from .generic import DESIGN, DESIGN_WARM, Part, Prepared, chunk_size, fit_chunk, prepare
 from .residuals import BAD_FIT_PROBABILITY, tail_probability
+from .tilt import fit_tilted
 
 __all__ = ["fit"]
 
@@ -79,6 +81,8 @@ def fit(model: Model, measurement: Measurement, start: Fit | None = None, progre
             raise ValueError(f"start has pixel shape {start.status.shape} and measurement {shape}; they must agree.")
     if not model.free:
         raise ValueError("model has no free parameter to fit; fix fewer of them.")
+    if isinstance(model.misalignment, TiltPlane):
+        return fit_tilted(model, measurement, start, progress, fit)
     earlier = None
     if start is not None:
         earlier = Parameters(*(np.asarray(x).reshape(-1) for x in start.parameters))

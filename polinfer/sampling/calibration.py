@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import as_generator, complex_array, integer, one_of_types, real_number
+from ..misalignment import TiltPlane
 from ..model import Model
 from ..noise import InferredNoise
 from ..records import Measurement, Parameters
@@ -91,6 +92,10 @@ def calibration_ranks(
     one_of_types("sampler", sampler, (Gibbs, Ensemble), "pass Gibbs(...) or Ensemble(...).")
     if model.neighbours is not None:
         raise ValueError("model has neighbours; calibrate it without, every simulation is a pixel of its own.")
+    if isinstance(model.misalignment, TiltPlane):
+        raise ValueError(
+            "model has a TiltPlane, which ties all pixels; calibrate it without, every simulation is a pixel."
+        )
     generator, seed = as_generator(rng)
     truth = Parameters(
         *(

@@ -39,6 +39,8 @@ class Draws:
     gain: draws of the complex gain of the pixel, ``(chain, draw, *P)``, None if the model has none.
     sigma: draws of sigma where it is inferred, ``(chain, draw, *P)``, else None.
     seed: seed of the generator. sampler: settings of the sampler.
+    tilt: draws of the tilt's coefficients ``(chain, draw, *frames, terms)``, each shared by the pixels of its frame,
+        None if the model has no :class:`polinfer.TiltPlane`; ``model.misalignment.phase(tilt, shape)`` are the phases.
 
     Raises
     ------
@@ -64,6 +66,7 @@ class Draws:
     sigma: np.ndarray | None = array(("chain", "draw", "*P"), "1")
     seed: int = setting()
     sampler: Any = setting()
+    tilt: np.ndarray | None = array(("chain", "draw", "*P", "term"), "rad", default=None)
 
     def __post_init__(self) -> None:
         one_of_types("model", self.model, (Model,), "pass the Model of the draws.")

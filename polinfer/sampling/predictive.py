@@ -21,6 +21,7 @@ from ..statistics import Statistics, Summary, summarise
 from ..storage import array
 from .blocks import blocks, flat
 from .diagnostics import NO_DRAWS
+from .tilt import phase_of
 
 if TYPE_CHECKING:
     from .draws import Draws
@@ -64,13 +65,25 @@ class Predictive:
 
 
 @partial(jax.jit, static_argnums=0)
-def _residuals(model: Model, parameters: Parameters, gain: jax.Array, statistics: Statistics) -> jax.Array:
-    """``sum_k w_k |V_k - g J U_k|^2`` in the unit of the statistics; gain and parameters ``(draw, pixel)``."""
-    rest = gain[..., None, None] * multiply(model.jones(parameters), statistics.illumination) - statistics.response
+def _jones(model: Model, parameters: Parameters, phase: jax.Array | None) -> jax.Array:
+    """``T^-1 J T``, or J where there is no tilt."""
+    matrix = model.jones(parameters)
+    if phase is None:
+        return matrix
+    turn = jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
+    one = jnp.ones_like(turn)
+    top, bottom = jnp.stack([one, turn], axis=-1), jnp.stack([jnp.conj(turn), one], axis=-1)
+    return matrix * jnp.stack([top, bottom], axis=-2)
+
+
+@partial(jax.jit, static_argnums=0)
+def _residuals(
+    model: Model, parameters: Parameters, gain: jax.Array, phase: jax.Array | None, statistics: Statistics
+) -> jax.Array:
+    """``sum_k w_k |V_k - g J U_k|^2`` in the unit of the statistics; gain, parameters and tilt ``(draw, pixel)``."""
+    matrix = _jones(model, parameters, phase)
+    rest = gain[..., None, None] * multiply(matrix, statistics.illumination) - statistics.response
     return jnp.sum(jnp.real(rest) ** 2 + jnp.imag(rest) ** 2, axis=(-1, -2)) + statistics.residual
-
-
-_jones = jax.jit(Model.jones, static_argnums=0)
 
 
 def _summary(draws: Draws) -> Summary:
@@ -129,9 +142,9 @@ def predict(draws: Draws, rng: int | np.random.Generator | None, count: int, res
         # code is compiled for a shape: pad to a power of two, as the fit does
         size = max(1 << (len(part) - 1).bit_length(), LEAST)
         padded = np.concatenate([part, np.full(size - len(part), part[0])])
-        parameters, gain = _device(draws, used, padded)
+        parameters, gain, phase = _device(draws, used, padded)
         own = as_device(Statistics(*(x[padded] for x in statistics)), draws.measurement.response.dtype)
-        found = 2 * np.asarray(_residuals(draws.model, parameters, gain, own), float)[:, : len(part)]
+        found = 2 * np.asarray(_residuals(draws.model, parameters, gain, phase, own), float)[:, : len(part)]
         if draws.sigma is not None:
             found /= _chosen(draws.sigma, used, part).astype(float) ** 2
         freedom = degrees.reshape(-1)[part]
@@ -147,13 +160,17 @@ def predict(draws: Draws, rng: int | np.random.Generator | None, count: int, res
                       seed)  # fmt: skip
 
 
-def _device(draws: Draws, used: np.ndarray, pixels: np.ndarray) -> tuple[Parameters, jax.Array]:
-    """Parameters and gain ``(draw, pixel)`` as JAX arrays in the precision of the measurement."""
+def _device(draws: Draws, used: np.ndarray, pixels: np.ndarray) -> tuple[Parameters, jax.Array, jax.Array | None]:
+    """Parameters, gain and phase of the tilt ``(draw, pixel)`` as JAX arrays in the measurement's precision."""
     complex_type = jax.dtypes.canonicalize_dtype(draws.measurement.response.dtype)
     real_type = np.zeros((), complex_type).real.dtype
     parameters = Parameters(*(jnp.asarray(_chosen(x, used, pixels).astype(real_type)) for x in draws.parameters))
     gain = np.ones((len(used), len(pixels))) if draws.gain is None else _chosen(draws.gain, used, pixels)
-    return parameters, jnp.asarray(gain.astype(complex_type))
+    phase = None
+    if draws.tilt is not None:
+        each = draws.tilt.reshape(draws.chains * draws.count, *draws.tilt.shape[2:])[used]
+        phase = jnp.asarray(phase_of(draws.model, each, draws.shape, pixels).astype(real_type))
+    return parameters, jnp.asarray(gain.astype(complex_type)), phase
 
 
 def _responses(draws: Draws, used: np.ndarray, good: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -168,8 +185,8 @@ def _responses(draws: Draws, used: np.ndarray, good: np.ndarray, rng: np.random.
         spread = np.where(weight > 0, weight, np.nan) ** -0.5
     known = None if draws.sigma is not None else np.asarray(draws.model.noise.sigma(measurement)).reshape(-1)
     for part in blocks(good, 8 * len(used) * states):
-        parameters, gain = _device(draws, used, part)
-        clean = np.asarray(_jones(draws.model, parameters)) @ illumination[part]
+        parameters, gain, phase = _device(draws, used, part)
+        clean = np.asarray(_jones(draws.model, parameters, phase)) @ illumination[part]
         sigma = _chosen(draws.sigma, used, part) if known is None else np.broadcast_to(known[part], gain.shape)
         pair = rng.normal(scale=0.5**0.5, size=(2, *clean.shape))
         noise = sigma[..., None, None] * spread[part][:, None, :] * (pair[0] + 1j * pair[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +12,15 @@ from ..checks import as_generator, integer, one_of_types
 from ..degeneracy import nearest
 from ..fitting import fit
 from ..fitting.local_gaussian import equivalent
+from ..fitting.tilt import shares
 from ..model import Model
 from ..records import Fit, Measurement, Parameters, Status
+from ..tilting import untilt
 from .draws import Draws
 from .ensemble import Ensemble, draw_ensemble
 from .gibbs import Gibbs, draw_gibbs, part_of, problem_of
 from .raw import Raw
+from .tilt import draw_coefficients, move
 
 __all__ = ["Call", "begin", "draw", "sample", "spread", "status_of"]
 
@@ -111,6 +115,18 @@ def draw(call: Call, parts: Iterable[np.ndarray], progress: bool) -> Iterator[Ra
     from tqdm import tqdm
 
     model, measurement, sampler, chains, draws, seed, found, good = call
+    if found.tilt is not None:
+        plain = call._replace(
+            model=replace(model, misalignment=None),
+            measurement=untilt(measurement, found.tilt.phase),
+            found=replace(found, model=replace(model, misalignment=None), tilt=None),
+        )
+        parts = list(parts)
+        coefficients = draw_coefficients(found, chains, draws, seed)
+        for part, raw in zip(parts, draw(plain, parts, progress), strict=True):
+            moved = _aligned(move(raw.parameters, found, coefficients, good[part]), found, good[part])
+            yield raw._replace(parameters=moved)
+        return
     if isinstance(sampler, Ensemble):
         for part in parts:
             raw = draw_ensemble(model, measurement, sampler, chains, draws, seed, progress, good[part], found)
@@ -158,8 +174,12 @@ def _assemble(call: Call, raw: Raw) -> Draws:
     values = {name: framed(getattr(raw.parameters, name)) for name in Parameters._fields}
     for name in model.dropped:
         values[name] = np.full_like(values[name], np.nan)
+    evidence, tilt = framed(raw.log_evidence), None
+    if call.found.tilt is not None:
+        evidence = evidence + shares(call.found)
+        tilt = draw_coefficients(call.found, call.chains, call.draws, call.seed)
     return Draws(
-        model, call.measurement, Parameters(**values), framed(raw.log_evidence), framed(raw.log_evidence_error),
+        model, call.measurement, Parameters(**values), evidence, framed(raw.log_evidence_error),
         status_of(call.found, good, raw.converged).reshape(shape), framed(raw.gain), framed(raw.sigma), call.seed,
-        call.sampler,
+        call.sampler, tilt,
     )  # fmt: skip

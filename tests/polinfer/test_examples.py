@@ -33,6 +33,11 @@ def test_texture(tmp_path):
     assert isinstance(polinfer.load(tmp_path / "texture.nc"), polinfer.texture.FitTexture)
 
 
+def test_tilted_arms(tmp_path):
+    assert "tilted" in run("07_tilted_arms.py", tmp_path)
+    assert (tmp_path / "tilted_arms.png").stat().st_size > 10_000
+
+
 def test_measured_fibre(tmp_path):
     fibre_folder()
     assert "BAD_FIT" in run("02_measured_fibre.py", tmp_path)

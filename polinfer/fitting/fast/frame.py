@@ -145,7 +145,7 @@ def fast_scene(model: Model) -> Scene | None:
     """The scene of a model whose statistics are those of single pixels, sigma given; None if it has no fast form."""
     if model.noise.integrated or (model.neighbours is not None and model.gain is not None):
         return None
-    return scene(replace(model, noise=KnownNoise(), neighbours=None))
+    return scene(replace(model, noise=KnownNoise(), neighbours=None, misalignment=None))
 
 
 def fit_part(known: Scene, prepared: Prepared, chosen: np.ndarray, earlier: Parameters | None) -> Part:
