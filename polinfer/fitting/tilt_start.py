@@ -138,7 +138,10 @@ def fold(coefficients: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """
     found = np.array(coefficients, float)
     for k, n in ((1, shape[0]), (2, shape[1])):
-        turns = np.ceil(found[k] / (pi * n) - 0.5) if n > 1 else 0.0
+        if n == 1:  # no slope along a single line; rounding aside its prior's mean is left
+            found[k] = 0
+            continue
+        turns = np.ceil(found[k] / (pi * n) - 0.5)
         found[k] -= pi * n * turns
         # v runs through (r + 1/2)/n - 1/2: half a step is left over
         found[0] += pi * turns * (0.5 - 0.5 * n)
