@@ -197,7 +197,7 @@ def climb(
         value, at = evaluate(scene, data, point)
         return Place(point, at, value / data.one)
 
-    structure = jax.tree.structure(jax.eval_shape(look, point_of(scene, start)))
+    structure: Any = jax.tree.structure(jax.eval_shape(look, point_of(scene, start)))
 
     def packed(place: Place) -> Any:
         # one array: the compiler makes one piece of code of a choice between two of them, not one for each component

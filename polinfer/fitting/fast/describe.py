@@ -68,7 +68,8 @@ def _choose(scene: Scene, one: Any, point: Point, values: Parameters) -> tuple[P
                 candidates.append(_candidate(scene, indices, copy, point, values))
         chosen = _best(candidates, values) / one
         for m, i in enumerate(indices):
-            value, sign = candidates[0].values[m], moves[0][m][0]
+            value: Any = candidates[0].values[m]
+            sign: Any = moves[0][m][0]
             alike = all(move[m][0] == sign for move in moves)
             for k in range(1, len(moves)):
                 value = jnp.where(chosen == k, candidates[k].values[m], value)
@@ -142,7 +143,7 @@ def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[
     that angle out. ``ROUGH`` marks a maximum that rounding may have missed by more than the precision promises.
     """
     point, at, value = place
-    gain = scene.likelihood.mean_gain(at)
+    gain: Any = scene.likelihood.mean_gain(at)
     if 2 in scene.free and not scene.bounded:  # the other sign of J, which a free phase takes up
         c, s = point.retardance
         down = c < 0
@@ -179,7 +180,8 @@ def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[
     total, doubtful = jnp.full_like(value, log(scene.groups[0][1])), jnp.zeros(value.shape, bool)
     own = log_prior(scene.prior, point)
     for prior, count in scene.groups[1:]:
-        change, b = [ZERO] * n, dict(a)
+        b = dict(a)
+        change: list[Any] = [ZERO] * n
         differ = [i for i in free if prior[i] != scene.prior[i]]
         for i in differ:
             slope, bend = _difference(prior[i], scene.prior[i], point[i])

@@ -106,7 +106,7 @@ def _point(scene: Scene, place: _Place) -> Point:
 
 
 def _stack(components: list[Any], pixels: int) -> np.ndarray:
-    return np.stack([np.zeros(pixels) if x is None else np.broadcast_to(x, pixels) for x in components], axis=-1)
+    return np.stack([x + np.zeros(pixels) for x in components], axis=-1)
 
 
 def _vectors(scene: Scene, place: _Place, point: Point) -> tuple[dict[Any, np.ndarray], dict[Any, np.ndarray]]:
