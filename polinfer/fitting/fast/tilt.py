@@ -25,19 +25,10 @@ import numpy as np
 from ...statistics import Statistics
 from ...threads import each
 from . import kernel
-from .climb import (
-    LEAST_CURVATURE,
-    Posterior,
-    climb,
-    derivatives,
-    evaluate,
-    frozen,
-    held,
-    kept,
-    with_prior,
-)
+from .climb import LEAST_CURVATURE, Posterior, climb, derivatives, frozen, held, with_prior
 from .data import Data, prepare
 from .engine import BLOCKS
+from .known import ZERO, Known
 from .linear import Triangle, factorise, solve
 from .overlap import Pauli, coefficients, energy, imaginary, overlap_slopes, turned
 from .point import Point, Vector, dot, polariser_vectors, retarder_vectors, unit
@@ -84,13 +75,12 @@ def _energy(retarder_first: bool, s: Pauli, point: Point) -> _Phase:
     (c, e), (p, r) = point.diattenuation, point.diattenuation_angle
     sine, cosine = 2 * e * c, c * c - e * e
     if not retarder_first:
-        zero = s.y[0] * 0
-        x, y, slopes = s.x[0], s.y[0], [zero, zero, zero]
+        x, y, slopes = s.x[0], s.y[0], [ZERO, ZERO, ZERO]
     else:
         q, dq = retarder_vectors(point)
         z_, x_, y_ = s.z[0], s.x[0], s.y[0]
-        y_matrix = [[y_, -x_, -z_, None], [-x_, -y_, None, -z_], [-z_, None, -y_, x_], [None, -z_, x_, y_]]
-        x_matrix = [[x_, y_, None, z_], [y_, -x_, -z_, None], [None, -z_, x_, y_], [z_, None, y_, -x_]]
+        y_matrix = [[y_, -x_, -z_, ZERO], [-x_, -y_, ZERO, -z_], [-z_, ZERO, -y_, x_], [ZERO, -z_, x_, y_]]
+        x_matrix = [[x_, y_, ZERO, z_], [y_, -x_, -z_, ZERO], [ZERO, -z_, x_, y_], [z_, ZERO, y_, -x_]]
         image = [dot(line, q) for line in y_matrix]
         y, x = dot(q, image), dot(q, [dot(line, q) for line in x_matrix])
         slopes = [2 * dot(image, dq[j,]) for j in (2, 3, 4)]
@@ -143,11 +133,11 @@ def _eliminate(scene: Scene, local: Posterior, phase: _Phase, stuck: dict[int, A
     """The pixel's own angles eliminated, as far as there is a maximum; ``value`` is what is left to climb."""
     free, n = scene.free, len(scene.free)
     a: Triangle = {(m, k): -local.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
-    lower, smallest = factorise(a, n, LEAST_CURVATURE)
+    factor = factorise(a, n, LEAST_CURVATURE)
     mixed = [jnp.where(stuck[i], 0, phase.mixed[i]) if i in stuck else phase.mixed[i] for i in free]
-    follow, drop = solve(lower, mixed)
-    step, left = solve(lower, [local.gradient[i] for i in free])
-    there = smallest > 0
+    follow, drop = solve(factor.lower, mixed)
+    step, left = solve(factor.lower, [local.gradient[i] for i in free])
+    there = factor.smallest > 0
     slope = phase.first + jnp.where(there, sum(b * s for b, s in zip(mixed, step, strict=True)), 0)
     return _Eliminated(
         jnp.where(there, 0.5 * left, 0),
@@ -186,12 +176,16 @@ def _respond(
     a, b = start[8], start[9]
     turned_pair = (a * jnp.cos(shift) - b * jnp.sin(shift), a * jnp.sin(shift) + b * jnp.cos(shift))
     told = [(start[2 * i], start[2 * i + 1]) for i in range(4)] + [turned_pair]
-    told = [pair if known is None else closed[i] for i, (pair, known) in enumerate(zip(told, scene.fixed, strict=True))]
-    point = jax.tree.map(partial(jnp.where, given != kernel.CLOSED_FORM), Point(*told), closed)
-    point = climb(scene, balanced, data, point, iterations, given != kernel.STAY)
-    value, at = evaluate(scene, data, point)
-    likelihood = kept(one, derivatives(scene, balanced, data, point, at))
-    change = jax.tree.map(lambda x: x / one, _likelihood(scene, balanced, data, point, at))
+    begun = jnp.stack([x for i in scene.free for x in told[i]])
+    begun = jnp.where(given != kernel.CLOSED_FORM, begun, jnp.stack(jax.tree.leaves(closed)))
+    (point, at, value), _ = climb(scene, balanced, data, begun, iterations, given != kernel.STAY)
+
+    def arrays(tree: Any) -> Any:
+        # behind a division by 1, as in the climb, and nothing merely known
+        return jax.tree.map(lambda x: x / one + jnp.zeros_like(value), tree, is_leaf=lambda x: isinstance(x, Known))
+
+    likelihood = arrays(derivatives(scene, balanced, data, point, at))
+    change = arrays(_likelihood(scene, balanced, data, point, at))
     whole = with_prior(scene.prior, point, likelihood)
     stuck = frozen(scene, point, whole.gradient)
     own = _eliminate(scene, held(whole, stuck), _with_prior(scene.prior, point, change), stuck)
@@ -218,7 +212,7 @@ def _respond(
     if 4 in scene.free:
         follow[4] = follow[4] + 1
     rows = [value + top + jnp.log(total), slope, square - slope * slope, *follow, *(x for pair in point for x in pair)]
-    return jnp.stack([jnp.broadcast_to(x, value.shape) for x in rows])
+    return jnp.stack([x + jnp.zeros_like(value) for x in rows])
 
 
 @jax.jit
@@ -239,7 +233,7 @@ def phase_responses(
     which no change to an equivalent set is made, or None: the closed form.
     """
     pixels, dtype = len(statistics.residual), statistics.residual.dtype
-    size = BLOCKS[0] if pixels <= BLOCKS[0] else BLOCKS[1]
+    size = BLOCKS[pixels > BLOCKS[1]]
     out = np.empty((18, pixels), dtype)
     nothing, none = kernel.no_start(size, dtype), jnp.zeros(size, dtype)
     given = kernel.CLOSED_FORM
