@@ -9,7 +9,7 @@ import inspect
 import jax
 
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
-ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "posterior", "calibration")
+ALL = (*QUICK, "peers", "chain", "parts", "hard_cases", "ordering", "posterior", "calibration", "variational")
 
 
 def main() -> None:
