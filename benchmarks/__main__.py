@@ -20,6 +20,7 @@ ALL = (
     "misalignment",
     "posterior",
     "calibration",
+    "variational",
     "texture",
     "contrast",
     "cohort_contrast",

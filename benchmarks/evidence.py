@@ -2,8 +2,8 @@
 
 Where all Cramer-Rao bounds are below 0.1: a product Gauss-Hermite rule of 7^5 nodes in the axes of the local Gaussian,
 every copy of the parameter set counted by its own prior; 5^5 nodes say how exact that is, and where it is not (near an
-edge of D or eta) scrambled Sobol points take over. Beyond that, unit gain and balanced states: four dimensions
-on a grid over the whole ranges and the circularity by a Bessel function.
+edge of D or eta) scrambled Sobol points take over. Beyond that, unit gain and balanced states: four dimensions where
+the density is, and the circularity by a Bessel function (:mod:`benchmarks.quadrature`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from itertools import product
 from math import log, pi, sqrt
 
 import numpy as np
-from scipy.special import i0e, ndtri
+from scipy.special import ndtri
 from scipy.stats import qmc
 
 import polinfer
 from benchmarks import scenes
 from benchmarks.oracle import Oracle
+from benchmarks.quadrature import nested
 from benchmarks.results import Results
 from polinfer import ComplexGain, Model, Parameters, PhaseGain, PolariserFirst, RetarderFirst
 
@@ -28,8 +29,7 @@ SIGMAS = (0.005, 0.02, 0.05)
 NODES = (5, 7)
 SOBOL, WIDER = 15, 1.5
 GAINS = {"unit": None, "phase": PhaseGain(), "complex": ComplexGain(1.0)}
-# nodes of theta_D and theta_eta, twice those of delta and eta; a grid coarser by a fifth says how exact they are
-GRID = {0.1: 140, 0.2: 80, 0.4: 56}
+BROAD = (0.02, 0.1, 0.2, 0.4)
 
 
 @cache
@@ -99,37 +99,6 @@ def local_quadrature(
     return np.array(found).T
 
 
-def whole_quadrature(oracle: Oracle, response: np.ndarray, illumination: np.ndarray, sigma: float, n: int) -> float:
-    """Log evidence of one pixel over the whole ranges; balanced states, unit gain.
-
-    There ``|J U|^2`` is n for every J, and the log likelihood is linear in the retarder, whose coordinates are
-    ``cos eta/2, sin eta/2 (cos 2t, sin 2t cos xi, sin 2t sin xi)``; with its prior the circularity gives a Bessel
-    function. Two of the symmetries leave D >= 0 and eta >= 0.
-    """
-    units = np.array([[[1, 0], [0, 1]], [[1j, 0], [0, -1j]], [[0, -1j], [-1j, 0]], [[0, -1], [1, 0]]])
-    x, w = np.polynomial.legendre.leggauss(n // 2)
-    circle = pi * np.arange(n) / n
-    delta, angle = (y.ravel() for y in np.meshgrid(pi / 4 * (x + 1), circle, indexing="ij"))
-    nothing = np.zeros_like(delta)
-    polariser = np.moveaxis(oracle.jones((np.sin(delta), angle, nothing, nothing, nothing)), -1, 0)
-    data = response @ illumination.conj().T
-    pairs = (polariser[:, None] @ units) if oracle.ordering == "RetarderFirst" else (units @ polariser[:, None])
-    slopes = 2 / sigma**2 * np.einsum("pkij,ij->pk", pairs.conj(), data).real
-    weight = oracle.log_prior((np.sin(delta), 0.0, 0.0, 0.0, pi / 2)) + np.log(np.cos(delta))
-    weight = weight + np.log(w * pi / 4).repeat(n) + 2 * log(pi / n)
-    eta, t = np.meshgrid(pi / 2 * (x + 1), circle, indexing="ij")
-    c, s = np.cos(eta / 2), np.sin(eta / 2)
-    size = np.linalg.norm(slopes, axis=1) + weight
-    total = []
-    for x0, weighs in zip(slopes[size > size.max() - 40], weight[size > size.max() - 40], strict=True):
-        bessel = np.hypot(x0[2] * s * np.sin(2 * t) + 1, x0[3] * s * np.sin(2 * t))
-        terms = c * x0[0] + s * np.cos(2 * t) * x0[1] + bessel + np.log(2 * pi * i0e(bessel)) + weighs
-        total.append(np.logaddexp.reduce(terms + np.log(w * pi / 2)[:, None], axis=None))
-    states = illumination.shape[-1]
-    constant = -2 * states * log(pi * sigma**2) - (np.sum(np.abs(response) ** 2) + states) / sigma**2
-    return float(constant + log(4) + np.logaddexp.reduce(total))
-
-
 def narrow(results: Results, pixels: int) -> None:
     """Differences where all bounds are small."""
     rng, states = np.random.default_rng(2), scenes.balanced_states()
@@ -163,14 +132,14 @@ def narrow(results: Results, pixels: int) -> None:
 def wide(results: Results, pixels: int) -> None:
     """Differences where some bounds are larger."""
     rng, states = np.random.default_rng(3), scenes.balanced_states()
-    for (sigma, n), ordering in product(GRID.items(), (RetarderFirst(), PolariserFirst())):
+    for sigma, ordering in product(BROAD, (RetarderFirst(), PolariserFirst())):
         model = Model(ordering)
         truth = scenes.from_priors(model, pixels, rng)
         data = scenes.measure(model, truth, states, sigma, rng=int(rng.integers(2**31)))
         result = polinfer.fit(model, data)
         oracle = Oracle(type(ordering).__name__, "unit")
-        whole = np.array([whole_quadrature(oracle, v, states, sigma, n) for v in data.response])
-        coarse = [whole_quadrature(oracle, v, states, sigma, n - n // 5) for v in data.response[:4]]
+        whole = np.array([nested(oracle, v, states, sigma) for v in data.response])
+        coarse = [nested(oracle, v, states, sigma, 0.8) for v in data.response[:4]]
         difference = result.log_evidence - whole
         largest = np.max(polinfer.cramer_rao_bound(model, truth, states, sigma), axis=0)
         for low, high in ((0, 0.1), (0.1, 0.3), (0.3, 1), (1, np.inf)):
@@ -192,7 +161,7 @@ def main(size: int | None = None, full: bool = False) -> None:
     axes = figure.subplots()
     rows = [row for row in results.rows if "largest_bound" in row]
     groups = list(dict.fromkeys(row["largest_bound"] for row in rows))
-    for sigma in GRID:
+    for sigma in BROAD:
         own = [row for row in rows if row["sigma"] == sigma and row["ordering"] == "RetarderFirst"]
         axes.semilogy([groups.index(row["largest_bound"]) for row in own], [row["worst"] for row in own], "o-",
                       label=f"sigma {sigma}")  # fmt: skip

@@ -5,22 +5,23 @@ Speed: 27 x 36 pixels, three balanced states, truths from the priors; draws unti
 apart by :meth:`polinfer.Draws.diagnostics`. Time is that of :func:`polinfer.sample` without evidence, fit
 included, compiled before; the same with sigma inferred in every pixel. Summaries of a large frame in parts
 (:func:`polinfer.summarise`): time a pixel, and by how much the memory of the process grows from a quarter of the
-frame to the whole. Evidence: pixels with D from 0 to the edge against the four-dimensional grid of
-:mod:`benchmarks.evidence`, with its time. Agreement: means of invariants of ``Gibbs`` and ``Ensemble``.
+frame to the whole. Evidence: pixels with D from 0 to the edge against :mod:`benchmarks.quadrature`, with its time.
+Agreement: means of invariants of ``Gibbs`` and ``Ensemble``.
 """
 
 from __future__ import annotations
 
 import resource
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
-from scipy.stats import kstest, norm
+from scipy.stats import kstest, ttest_ind
 
 import polinfer
 from benchmarks import scenes
-from benchmarks.evidence import GRID, whole_quadrature
 from benchmarks.oracle import Oracle
+from benchmarks.quadrature import importance, nested
 from benchmarks.results import Results, alternating_seconds, median_seconds, seconds
 from polinfer import (
     ComplexGain,
@@ -102,60 +103,66 @@ def stream(results: Results, pixels: int) -> None:
     results.bar("growth of the peak memory from a quarter of the frame to the whole", peak[1] - peak[0], 0.5, "GB")
 
 
-def evidence(results: Results, sigmas: tuple[float, ...]) -> None:
-    """Against quadrature."""
-    states, worst, z = scenes.balanced_states(), 0.0, []
-    for ordering in (RetarderFirst(), PolariserFirst()):
-        for sigma in sigmas:
-            model = Model(ordering)
-            truth = scenes.from_priors(model, 2 * len(SPREAD_D), np.random.default_rng(4))
-            truth = truth._replace(diattenuation=np.repeat(SPREAD_D, 2))
-            data = scenes.measure(model, truth, states, sigma, rng=5)
-            draws = polinfer.sample(model, data, Gibbs(), draws=DRAWS, rng=6)
-            cost = seconds(lambda m=model, d=data: polinfer.sample(m, d, Gibbs(), draws=DRAWS, rng=6)) - seconds(
-                lambda m=model, d=data: polinfer.sample(m, d, Gibbs(evidence=False), draws=DRAWS, rng=6)
-            )
+def evidence(results: Results, sigmas: tuple[float, ...], kinds: tuple[str, ...]) -> None:
+    """Against quadrature (unit gain) and importance sampling (complex gain), 20 pixels a case."""
+    states, worst, z = scenes.balanced_states(), dict.fromkeys(kinds, 0.0), []
+    for ordering, gain, sigma in product((RetarderFirst(), PolariserFirst()), kinds, sigmas):
+        model = Model(ordering, gain=GAINS[gain][0])
+        truth = scenes.from_priors(model, 2 * len(SPREAD_D), np.random.default_rng(4))
+        truth = truth._replace(diattenuation=np.repeat(SPREAD_D, 2))
+        data = scenes.measure(model, truth, states, sigma, rng=5)
+        draws = polinfer.sample(model, data, Gibbs(), draws=DRAWS, rng=6)
+        cost = seconds(lambda m=model, d=data: polinfer.sample(m, d, Gibbs(), draws=DRAWS, rng=6)) - seconds(
+            lambda m=model, d=data: polinfer.sample(m, d, Gibbs(evidence=False), draws=DRAWS, rng=6)
+        )
+        found = polinfer.fit(model, data)
+        if gain == "unit":
             oracle = Oracle(type(ordering).__name__, "unit")
-            expected = [whole_quadrature(oracle, r, states, sigma, GRID[sigma]) for r in data.response]
-            off = draws.log_evidence - expected
-            laplace = polinfer.fit(model, data).log_evidence - expected
-            worst = max(worst, float(np.abs(off).max()))
-            z += list(off / draws.log_evidence_error)
-            results.add(
-                ordering=type(ordering).__name__, evidence_sigma=sigma, worst=float(np.abs(off).max()),
-                rms=float(np.sqrt(np.mean(off**2))), stated=float(draws.log_evidence_error.max()),
-                worst_laplace=float(np.abs(laplace).max()), milliseconds_a_pixel=1e3 * cost / len(off),
-            )  # fmt: skip
+            values = [(nested(oracle, r, states, sigma), 0.0) for r in data.response]
+        else:
+            values = [importance(model, data, found, pixel, 1) for pixel in range(len(data.response))]
+        expected, error = np.array(values).T
+        off = draws.log_evidence - expected
+        worst[gain] = max(worst[gain], float(np.abs(off).max()))
+        z += list(off / np.hypot(draws.log_evidence_error, error))
+        results.add(
+            ordering=type(ordering).__name__, gain=gain, evidence_sigma=sigma, worst=float(np.abs(off).max()),
+            rms=float(np.sqrt(np.mean(off**2))), stated=float(draws.log_evidence_error.max()),
+            error_of_expected=float(error.max()), worst_laplace=float(np.abs(found.log_evidence - expected).max()),
+            milliseconds_a_pixel=1e3 * cost / len(off),
+        )  # fmt: skip
     print(f"  off over stated error: rms {np.sqrt(np.mean(np.square(z))):.2f}")
-    results.bar("log evidence against quadrature, worst pixel", worst, 0.02, "nat")
+    for gain, value in worst.items():
+        results.bar(f"log evidence, {gain} gain, against an independent computation, worst pixel", value, 0.02, "nat")
 
 
 def agreement(results: Results, pixels: int) -> None:
-    """Means of invariants of both samplers, in standard errors."""
-    states, z = scenes.balanced_states(), []
-    for sigma in (0.05, 0.4):
-        model = Model()
+    """Means of invariants and of their squares by both samplers, six chains each: Welch's test in every pixel."""
+    states, values = scenes.balanced_states(), []
+    sampler = Ensemble(warmup=100, thin=20, evidence=False)
+    for sigma, gain in ((0.05, None), (0.4, None), (0.4, ComplexGain(1.0))):
+        model = Model(gain=gain)
         truth = scenes.from_priors(model, pixels, np.random.default_rng(7))
         data = scenes.measure(model, truth, states, sigma, rng=8)
-        ensemble = polinfer.sample(model, data, Ensemble(), draws=32 * 20, rng=9)
-        gibbs = polinfer.sample(model, data, Gibbs(evidence=False), draws=2000, rng=9)
-        pairs = []
+        ensemble = polinfer.sample(model, data, sampler, chains=6, draws=32 * 5, rng=9)
+        gibbs = polinfer.sample(model, data, Gibbs(evidence=False), chains=6, draws=2000, rng=9)
+        means = []
         for draws in (gibbs, ensemble):
-            values = np.stack([np.asarray(x) for x in invariants(model, Parameters(*draws.parameters)).values()])
-            pairs.append((values.mean(axis=(1, 2)), values.mean(axis=2).var(axis=1, ddof=1) / CHAINS))
-        (a, va), (b, vb) = pairs
-        z += list(((a - b) / np.sqrt(va + vb)).ravel())
-    # means of four chains each: about Student with six degrees of freedom
-    p = kstest(norm.ppf(student(np.array(z))), norm.cdf).pvalue
-    results.bar("agreement of Gibbs and Ensemble, p-value of all comparisons", float(p), 0.01, at_least=True)
-    results.add(pixels=pixels, comparisons=len(z), rms_z=float(np.sqrt(np.mean(np.square(z)))), p_value=float(p))
-
-
-def student(z: np.ndarray) -> np.ndarray:
-    """Distribution function of Student's t with six degrees of freedom."""
-    from scipy.stats import t
-
-    return np.asarray(t.cdf(z, 6))
+            found = np.stack([np.asarray(x) for x in invariants(model, Parameters(*draws.parameters)).values()])
+            means.append(np.concatenate([found, found**2]).mean(axis=2))  # (functions, chains, pixels)
+        test = ttest_ind(*means, axis=1, equal_var=False)
+        values.append(test.pvalue)
+        results.add(
+            agreement_sigma=sigma, gain=type(gain).__name__, pixels=pixels, functions=len(test.pvalue),
+            below_5_percent=float(np.mean(test.pvalue < 0.05)), least_p=float(test.pvalue.min()),
+            least_p_of_uniform=float(min(kstest(x, "uniform").pvalue for x in test.pvalue)),
+        )  # fmt: skip
+    every = np.concatenate(values)
+    worst = float(every.min()) * every.size
+    uniform = min(kstest(x, "uniform").pvalue for x in every) * len(every)
+    results.bar("Gibbs and Ensemble: least p-value of a pixel, times their number", worst, 0.01, at_least=True)
+    results.bar("  p-values are uniform over the pixels: least p-value, times the number of functions", uniform, 0.01,
+                at_least=True)  # fmt: skip
 
 
 def main(size: int | None = None, full: bool = False) -> None:
@@ -164,7 +171,7 @@ def main(size: int | None = None, full: bool = False) -> None:
     speed(results, size or PIXELS)
     noise_unknown(results, size or PIXELS)
     stream(results, 65536 if full else 16384)
-    evidence(results, (0.1, 0.2, 0.4) if full else (0.4,))
+    evidence(results, (0.005, 0.02, 0.1, 0.4) if full else (0.02, 0.4), ("unit", "complex") if full else ("unit",))
     agreement(results, 50 if full else 6)
     results.save()
 

@@ -18,10 +18,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Bridge", "Proposal", "autocorrelation_time", "bridge", "fit_mixture"]
+from .charts import Target, draw_prior
+
+__all__ = [
+    "DEFENCE",
+    "Bridge",
+    "Proposal",
+    "autocorrelation_time",
+    "bridge",
+    "defended",
+    "fit_mixture",
+    "halves_bridged",
+]
 
 FREEDOM = 6.0  # degrees of freedom of the components: heavier tails than a Gaussian's
 ROUNDS, EM_ROUNDS = 200, 40
+DEFENCE = 0.1  # share of the prior in a mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +69,15 @@ class Proposal:
         for share, mean, root in zip(self.shares, self.means, self.roots, strict=True):
             terms.append(log((1 - self.defence) * share) + _log_student(points, mean, root))
         return np.asarray(np.logaddexp.reduce(np.stack(terms), axis=0))
+
+
+def defended(target: Target, mixture: tuple[np.ndarray, np.ndarray, np.ndarray], defence: float) -> Proposal:
+    """A mixture, and with a small probability the prior of the target."""
+
+    def draw(rng: np.random.Generator, count: int) -> np.ndarray:
+        return draw_prior(target.model, target.centre, rng, count)
+
+    return Proposal(*mixture, defence, draw, lambda points: target.evaluate(points)[1])
 
 
 def _log_student(points: np.ndarray, mean: np.ndarray, root: np.ndarray) -> np.ndarray:
@@ -131,14 +152,14 @@ class Bridge(NamedTuple):
 
 
 def bridge(target: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, values: np.ndarray, proposal: Proposal,
-           rng: np.random.Generator) -> Bridge:  # fmt: skip
+           rng: np.random.Generator, points: int = 1) -> Bridge:  # fmt: skip
     """Evidence of ``target`` from draws ``(chain, time, walker, k)`` and its logarithm ``values`` there.
 
-    The proposal must not be made of the same draws; as many points are drawn from it.
+    The proposal must not be made of the same draws; ``points`` times as many points are drawn from it.
     """
     shape = values.shape
     flat = draws.reshape(-1, draws.shape[-1])
-    other = proposal.draw(rng, len(flat))
+    other = proposal.draw(rng, points * len(flat))
     first = values.reshape(-1) - proposal.log_density(flat)
     second = target(other) - proposal.log_density(other)
     effective = len(flat) / autocorrelation_time(values)
@@ -168,3 +189,26 @@ def bridge(target: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, values
         means = denominator.reshape(shape[0], -1).mean(axis=1) / np.mean(denominator)
         between = float(np.var(means, ddof=1) / shape[0])
     return Bridge(guess, float(np.sqrt(variance + max(relative * time / len(flat), between))))
+
+
+def halves_bridged(
+    target: Target, places: np.ndarray, values: np.ndarray, stream: np.random.SeedSequence, components: int,
+    points: int = 1,
+) -> Bridge:  # fmt: skip
+    """Mean of two bridges: the mixture is fitted to one half of the chains, the bridge built to the other one.
+
+    A mixture that knows the draws it is compared with would give too little. A single chain is halved in time.
+    ``places`` ``(chain, time, walker, k)`` and the log densities ``values`` there.
+    """
+    rng, k = np.random.default_rng(stream), places.shape[-1]
+    if len(places) == 1:
+        length = values.shape[1] // 2 * 2
+        places, values = (x[:, :length].reshape(2, length // 2, *x.shape[2:]) for x in (places, values))
+    halves = np.array_split(np.arange(len(places)), 2)
+    found = []
+    for own, other in (halves, halves[::-1]):
+        mixture = fit_mixture(places[other].reshape(-1, k), components, rng)
+        found.append(bridge(target, places[own], values[own], defended(target, mixture, DEFENCE), rng, points))
+    logs, errors = np.array(found).T
+    error = 0.5 * max(float(np.sqrt(np.sum(errors**2))), abs(float(logs[0] - logs[1])))
+    return Bridge(float(np.mean(logs)), error)

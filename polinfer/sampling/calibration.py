@@ -130,11 +130,11 @@ def _ranks(
         found = sample(model, data, sampler, chains=1, draws=draws, rng=seed)
         kept = Parameters(*(x[0] for x in found.parameters))
     else:
-        # draws of an ensemble are its walkers in turn: as many records as there are walkers leave all of them far apart
-        found = sample(model, data, sampler, chains=2, draws=sampler.walkers * -(-draws // sampler.walkers), rng=seed)
-        flat = Parameters(*(x.reshape(-1, x.shape[-1]) for x in found.parameters))
-        take = np.linspace(0, len(flat.diattenuation) - 1, draws).astype(int)
-        kept = Parameters(*(x[take] for x in flat))
+        # draws of an ensemble are its walkers in turn
+        sampler = replace(sampler, evidence=False)
+        found = sample(model, data, sampler, chains=1, draws=max(draws, 2 * sampler.walkers), rng=seed)
+        take = np.linspace(0, found.count - 1, draws).astype(int)
+        kept = Parameters(*(x[0][take] for x in found.parameters))
     kept = kept._replace(**{name: np.zeros_like(kept.diattenuation) for name in model.dropped})
     true, drawn = invariants(model, truth), invariants(model, kept)
     return {name: np.sum(np.asarray(drawn[name]) < np.asarray(true[name]), axis=0) for name in true}

@@ -19,6 +19,7 @@ What is left are the bounds of delta, where its Jacobian ``cos delta`` vanishes,
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 from math import asin, inf, pi
@@ -34,9 +35,9 @@ from ..fitting.local_gaussian import distinct_copies
 from ..model import Model
 from ..records import PERIODS, Parameters
 
-__all__ = ["Target", "centre_of", "copies", "draw_prior", "periods"]
+__all__ = ["Target", "centre_of", "copies", "draw_prior", "into_chart", "log_window", "periods"]
 
-BLOCK = 1024  # points of a large batch; smaller ones are padded, so that two shapes are compiled
+BLOCK = 1024  # points of a large batch
 RAMP = 0.15  # half the length of the ramp between shares of 1 and 0, in periods
 CONTRAST = 6.0  # a copy at a distance has e^-12 of the weight
 
@@ -81,6 +82,14 @@ def draw_prior(model: Model, centre: np.ndarray, rng: np.random.Generator, count
     """Coordinates ``(count, free)`` whose density is ``Target.evaluate(x)[1]``."""
     columns = {name: np.asarray(model.priors[name].sample(rng, (count,)), float) for name in model.free}
     x = centre_of(model, Parameters(**(dict.fromkeys(Parameters._fields, 0.0) | columns)))
+    return into_chart(model, centre, x, rng)
+
+
+def into_chart(model: Model, centre: np.ndarray, x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Coordinates ``(points, free)`` moved to copies and turns at random, in proportion to the shares there.
+
+    Draws of a posterior (any copies) become draws of ``Target``.
+    """
     signs, shifts = copies(model)
     kernel = _log_kernel(model, centre, x)
     chosen = np.argmax(kernel + rng.gumbel(size=kernel.shape), axis=1)
@@ -94,18 +103,36 @@ def draw_prior(model: Model, centre: np.ndarray, rng: np.random.Generator, count
     return x
 
 
-def _root_share(u: np.ndarray) -> np.ndarray:
+def _root_share(u: Any) -> Any:
     """Square root of the share of an angle ``u`` periods from the centre."""
-    return np.asarray(np.cos(0.5 * pi * np.clip((np.abs(u) - 0.5 + RAMP) / (2 * RAMP), 0, 1)))
+    xp: Any = np if isinstance(u, np.ndarray) else jnp
+    return xp.cos(0.5 * pi * xp.clip((abs(u) - 0.5 + RAMP) / (2 * RAMP), 0, 1))
 
 
-def _log_kernel(model: Model, centre: np.ndarray, x: np.ndarray) -> np.ndarray:
+def _log_kernel(model: Model, centre: Any, x: Any) -> Any:
     """Logarithms of the shares ``(points, copies)`` of the copies of a point, up to a constant for each point."""
+    xp: Any = np if isinstance(x, np.ndarray) else jnp
     signs, shifts = copies(model)
     period = periods(model)
     circle = np.isfinite(period)
     u = (signs * x[:, None, :] + shifts - centre)[..., circle] / period[circle]
-    return np.asarray(CONTRAST * np.sum(np.cos(2 * pi * u), axis=-1))
+    return CONTRAST * xp.sum(xp.cos(2 * pi * u), axis=-1)
+
+
+def log_window(model: Model, centre: Any, x: Any) -> Any:
+    """What the log density of coordinates ``(points, free)`` is multiplied by, ``(points,)``: both shares together."""
+    xp: Any = np if isinstance(x, np.ndarray) else jnp
+    period = periods(model)
+    circle = np.isfinite(period)
+    u = (x[:, circle] - centre[circle]) / period[circle]
+    inside = xp.all(abs(u) < 0.5 + RAMP, axis=1)
+    if "diattenuation" in model.free:
+        inside = inside & (abs(x[:, model.free.index("diattenuation")]) <= asin(1.0))
+    factor = xp.where(inside[:, None], _root_share(u), 1.0)
+    kernel = _log_kernel(model, centre, x)
+    top = xp.max(kernel, axis=1)
+    share = kernel[:, 0] - top - xp.log(xp.sum(xp.exp(kernel - top[:, None]), axis=1))
+    return xp.where(inside, share + 2 * xp.sum(xp.log(factor), axis=1), -xp.inf)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -123,7 +150,16 @@ def _log_copies(model: Model, x: jax.Array, statistics: Any) -> tuple[jax.Array,
         values[name] = wrap(value, period) if np.isfinite(period) else value
     parameters = Parameters(**values)
     one = jax.tree.map(lambda a: a[None, None], statistics)
-    return model.log_density(parameters, one) + jacobian[:, None], model.log_prior(parameters) + jacobian[:, None]
+    found = model.log_density(parameters, one), model.log_prior(parameters)
+    density, prior = (jnp.where(jnp.isnan(a), -jnp.inf, a) + jacobian[:, None] for a in found)
+    return density, prior
+
+
+@partial(jax.jit, static_argnums=0)
+def _log_target(model: Model, x: jax.Array, centre: jax.Array, statistics: Any) -> jax.Array:
+    """Log density and log prior density of coordinates ``(points, free)``, ``(2, points)``."""
+    every = jnp.stack(_log_copies(model, x, statistics))
+    return jax.nn.logsumexp(every, axis=-1) + log_window(model, centre, x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +167,8 @@ class Target:
     """The density of one pixel in these coordinates; its integral over them is the evidence.
 
     ``statistics`` are those of one pixel or window, without a pixel axis, on the device; ``centre`` ``(free,)`` is
-    where the circles are unrolled from; batches of up to ``rows`` points are padded to that number.
+    where the circles are unrolled from. Batches are padded to ``rows``, four times as many, or ``BLOCK`` points, so
+    that three shapes are compiled.
     """
 
     model: Model
@@ -145,14 +182,20 @@ class Target:
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Log density and log prior density ``(points,)`` at coordinates ``(points, free)``."""
-        density, prior = self._raw(x)
-        window = self._log_window(x)
-        with np.errstate(invalid="ignore"):
-            return _no_nan(_log_sum(density) + window), _no_nan(_log_sum(prior) + window)
+        sizes = (size for size in (self.rows, 4 * self.rows) if len(x) <= size)
+        parts = [
+            np.asarray(_log_target(self.model, padded, self.centre, self.statistics), float)[:, :count]
+            for padded, count in self._batches(x, next(sizes, BLOCK))
+        ]
+        density, prior = np.concatenate(parts, axis=1)
+        return density, prior
 
     def unfold(self, x: np.ndarray, rng: np.random.Generator) -> Parameters:
         """Parameters ``(points,)`` of coordinates, each moved to one of its copies; NaN where dropped."""
-        density, _ = self._raw(x)
+        density = np.concatenate([
+            np.asarray(_log_copies(self.model, padded, self.statistics)[0], float)[:count]
+            for padded, count in self._batches(x, BLOCK)
+        ])  # fmt: skip
         chosen = np.argmax(density + rng.gumbel(size=density.shape), axis=1)  # draws from the normalised densities
         signs, shifts = copies(self.model)
         moved = signs[chosen] * x + shifts[chosen]
@@ -165,33 +208,8 @@ class Target:
         found |= {name: values[name] for name in self.model.fixed}
         return Parameters(**(found | {name: np.full(len(x), np.nan) for name in self.model.dropped}))
 
-    def _raw(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        size = self.rows if len(x) <= self.rows else BLOCK
-        parts = []
+    def _batches(self, x: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, int]]:
+        """The points in parts of one size, and how many of a part are meant."""
         for begin in range(0, len(x), size):
             part = x[begin : begin + size]
-            padded = np.concatenate([part, np.broadcast_to(self.centre, (size - len(part), x.shape[1]))])
-            density, prior = _log_copies(self.model, padded, self.statistics)
-            parts.append((np.asarray(density, float)[: len(part)], np.asarray(prior, float)[: len(part)]))
-        density, prior = (np.concatenate(x) for x in zip(*parts, strict=True))
-        return _no_nan(density), _no_nan(prior)
-
-    def _log_window(self, x: np.ndarray) -> np.ndarray:
-        period = periods(self.model)
-        circle = np.isfinite(period)
-        u = (x[:, circle] - self.centre[circle]) / period[circle]
-        inside = np.all(np.abs(u) < 0.5 + RAMP, axis=1)
-        if "diattenuation" in self.model.free:
-            inside &= np.abs(x[:, self.model.free.index("diattenuation")]) <= asin(1.0)
-        factor = np.where(inside[:, None], _root_share(u), 1.0)
-        kernel = _log_kernel(self.model, self.centre, x)
-        share = kernel[:, 0] - _log_sum(kernel)
-        return np.where(inside, share + 2 * np.sum(np.log(factor), axis=1), -np.inf)
-
-
-def _log_sum(values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.logaddexp.reduce(values, axis=1))
-
-
-def _no_nan(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isnan(values), -np.inf, values)
+            yield np.concatenate([part, np.broadcast_to(self.centre, (size - len(part), x.shape[1]))]), len(part)

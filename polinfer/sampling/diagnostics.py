@@ -227,4 +227,5 @@ def diagnose(
         r_hat[part[stuck]], ess[part[stuck]] = np.inf, 1.0
 
     each(judge, range(len(parts)))
-    return Diagnostics(r_hat.reshape(*status.shape, -1), ess.reshape(*status.shape, -1), names)
+    shape = (*status.shape, len(names))
+    return Diagnostics(r_hat.reshape(shape), ess.reshape(shape), names)

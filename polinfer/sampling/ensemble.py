@@ -24,8 +24,8 @@ from ..model import Model, as_device
 from ..noise import InferredNoise
 from ..records import Fit, Measurement, Parameters
 from ..statistics import Statistics
-from .bridge import Bridge, Proposal, autocorrelation_time, bridge, fit_mixture
-from .charts import Target, centre_of, draw_prior, periods
+from .bridge import DEFENCE, Bridge, Proposal, autocorrelation_time, defended, fit_mixture, halves_bridged
+from .charts import Target, centre_of, periods
 from .checkpoint import Checkpoint, fingerprint
 from .nuisances import draw_nuisances
 from .raw import Raw
@@ -42,7 +42,6 @@ MOVES: tuple[tuple[str, dict[str, float], float], ...] = (
     ("StretchMove", {}, 0.25),
 )
 MIXTURE = 0.3  # share of the steps that propose from the mixture found at the start
-DEFENCE = 0.1
 LEAST_EFFECTIVE, LEAST_TIMES, MOST_R_HAT = 100.0, 5.0, 1.05
 
 
@@ -62,6 +61,7 @@ class Ensemble:
     thin: steps between records, >= 1. With the default one record is nearly independent of the next.
     backend: folder (made if absent) in which the state is kept while sampling, so that the same call goes on where it
         was interrupted, with the same result; None: nothing is kept.
+    evidence: whether to compute the log evidence.
 
     Raises
     ------
@@ -77,6 +77,7 @@ class Ensemble:
     warmup: int = 200
     thin: int = 10
     backend: str | Path | None = None
+    evidence: bool = True
 
     def __post_init__(self) -> None:
         for name, low in (("walkers", 4), ("warmup", 0), ("thin", 1)):
@@ -86,6 +87,8 @@ class Ensemble:
         if self.backend is not None:
             one_of_types("backend", self.backend, (str, Path), "pass the path of a folder, or None.")
             object.__setattr__(self, "backend", str(self.backend))  # can be stored
+        if not isinstance(self.evidence, bool):
+            raise TypeError(f"evidence must be True or False, got {type(self.evidence).__name__}.")
 
 
 class _Chain(NamedTuple):
@@ -142,8 +145,8 @@ def draw_ensemble(
     for pixel in chosen:
         statistics = jax.tree.map(lambda x: x[0], prepared.pooled.take(np.array([pixel])))
         centre, covariance = _start(model, found, int(pixel))
-        target = Target(model, as_device(statistics, np.complex128), centre, max(2 * sampler.walkers, 32))
-        name = fingerprint(model, replace(sampler, backend=None), seed, int(pixel), statistics)
+        target = Target(model, as_device(statistics, np.complex128), centre, sampler.walkers // 2)
+        name = fingerprint(model, replace(sampler, backend=None, evidence=True), seed, int(pixel), statistics)
         runs = []
         for chain in range(chains):
             kept = None if folder is None else Checkpoint(folder / f"pixel_{pixel}_ensemble_{chain}.npz", name)
@@ -151,7 +154,7 @@ def draw_ensemble(
             runs.append(_run(target, covariance, sampler, -(-draws // sampler.walkers), stream, kept))
             bar.update(1)
         own = Statistics(*(x[pixel] for x in prepared.pooled.own))
-        pixels.append(_describe(target, own, runs, draws, [seed, int(pixel)]))
+        pixels.append(_describe(target, own, runs, draws, [seed, int(pixel)], sampler.evidence))
     bar.close()
     return _assemble(pixels, prepared, chains, draws)
 
@@ -285,7 +288,7 @@ def _spread(
 
     root = np.linalg.cholesky(covariance)
     around = np.full(2, 0.5), np.stack([target.centre] * 2), np.stack([root, 2 * root])
-    proposal = _defended(target, around, 0.4)
+    proposal = defended(target, around, 0.4)
     for _ in range(2):
         points = proposal.draw(rng, CANDIDATES)
         values, prior = target.evaluate(points)
@@ -294,17 +297,8 @@ def _spread(
         order = np.argsort(-keys)
         weights = np.exp(logs - np.logaddexp.reduce(logs))
         sample = points[rng.choice(len(points), size=CANDIDATES // 4, p=weights)]
-        proposal = _defended(target, fit_mixture(sample, COMPONENTS, rng), DEFENCE)
+        proposal = defended(target, fit_mixture(sample, COMPONENTS, rng), DEFENCE)
     return points[order[:walkers]], proposal
-
-
-def _defended(target: Target, mixture: tuple[np.ndarray, np.ndarray, np.ndarray], defence: float) -> Proposal:
-    """A mixture, and with a small probability the prior."""
-
-    def draw(rng: np.random.Generator, count: int) -> np.ndarray:
-        return draw_prior(target.model, target.centre, rng, count)
-
-    return Proposal(*mixture, defence, draw, lambda points: target.evaluate(points)[1])
 
 
 def _temper(logs: np.ndarray) -> np.ndarray:
@@ -319,7 +313,7 @@ def _temper(logs: np.ndarray) -> np.ndarray:
     return power * logs
 
 
-def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, seed: list[int]) -> _Pixel:
+def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, seed: list[int], wanted: bool) -> _Pixel:
     """Parameters, gain and sigma ``(chain, draw)``, evidence and convergence of one pixel."""
     places, values = (np.stack(x) for x in zip(*runs, strict=True))
     chains, k = len(runs), places.shape[-1]
@@ -333,28 +327,10 @@ def _describe(target: Target, own: Statistics, runs: list[_Chain], draws: int, s
     gain, sigma = (None if x[0] is None else np.stack(x) for x in zip(*drawn, strict=True))
     converged = _converged(places, values)
     evidence = Bridge(np.nan, np.nan)
-    if converged:
-        evidence = _evidence(target, places, values, np.random.SeedSequence([*seed, chains, 2]))
+    if converged and wanted:
+        stream = np.random.SeedSequence([*seed, chains, 2])
+        evidence = halves_bridged(target, places, values, stream, COMPONENTS)
     return _Pixel(kept, gain, sigma, evidence, converged)
-
-
-def _evidence(target: Target, places: np.ndarray, values: np.ndarray, stream: np.random.SeedSequence) -> Bridge:
-    """Mean of two bridges: the mixture is fitted to one half of the ensembles, the bridge built to the other one.
-
-    A mixture that knows the draws it is compared with would give too little. A single ensemble is halved in time.
-    """
-    rng, k = np.random.default_rng(stream), places.shape[-1]
-    if len(places) == 1:
-        length = values.shape[1] // 2 * 2
-        places, values = (x[:, :length].reshape(2, length // 2, *x.shape[2:]) for x in (places, values))
-    halves = np.array_split(np.arange(len(places)), 2)
-    found = []
-    for own, other in (halves, halves[::-1]):
-        mixture = fit_mixture(places[other].reshape(-1, k), COMPONENTS, rng)
-        found.append(bridge(target, places[own], values[own], _defended(target, mixture, DEFENCE), rng))
-    logs, errors = np.array(found).T
-    error = 0.5 * max(float(np.sqrt(np.sum(errors**2))), abs(float(logs[0] - logs[1])))
-    return Bridge(float(np.mean(logs)), error)
 
 
 def _converged(places: np.ndarray, values: np.ndarray) -> bool:

@@ -78,8 +78,7 @@ def summarise(
     if folder is not None and not isinstance(rng, int | np.integer):
         raise ValueError(f"folder needs a seed, so that the same call can go on; got rng={rng!r}, pass an integer.")
     call = begin(model, measurement, sampler, chains, draws, rng)
-    if isinstance(call.sampler, Gibbs):
-        call = call._replace(sampler=replace(call.sampler, evidence=False))
+    call = call._replace(sampler=replace(call.sampler, evidence=False))
     pixels = int(np.prod(measurement.shape))
     size = max(VALUES // (len(Parameters._fields) * call.chains * call.draws) // LEAST, 1) * LEAST
     begins = range(0, pixels, size)

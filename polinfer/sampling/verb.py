@@ -14,10 +14,12 @@ from ..fitting import fit
 from ..fitting.local_gaussian import equivalent
 from ..fitting.tilt import shares
 from ..model import Model
+from ..noise import InferredNoise
 from ..records import Fit, Measurement, Parameters, Status
 from ..tilting import untilt
 from .draws import Draws
 from .ensemble import Ensemble, draw_ensemble
+from .from_draws import bridged_evidence
 from .gibbs import Gibbs, draw_gibbs, part_of, problem_of
 from .raw import Raw
 from .tilt import draw_coefficients, move
@@ -25,6 +27,7 @@ from .tilt import draw_coefficients, move
 __all__ = ["Call", "begin", "draw", "sample", "spread", "status_of"]
 
 LEAST = 4  # draws of a chain
+POOR, FULL = 0.015, 4000  # nat, of an evidence by so many draws
 
 
 def sample(
@@ -105,6 +108,10 @@ def begin(
     generator, seed = as_generator(rng)
     if seed is None:
         seed = int(generator.integers(1 << 62))
+    by_frame = isinstance(model.noise, InferredNoise) and not model.noise.integrated
+    if by_frame and isinstance(sampler, Gibbs) and sampler.fallback is not None:
+        raise ValueError("sampler has a fallback, but model infers one sigma of the frame, which Ensemble cannot draw; "
+                         "use Gibbs() without one.")  # fmt: skip
     found = fit(model, measurement)
     good = np.flatnonzero(np.ravel(found.status & int(Status.MASKED | Status.NON_FINITE)) == 0)
     return Call(model, measurement, sampler, chains, draws, seed, found, good)
@@ -136,7 +143,39 @@ def draw(call: Call, parts: Iterable[np.ndarray], progress: bool) -> Iterator[Ra
     with tqdm(total=len(good), desc="sample", unit="pixel", disable=not progress) as bar:
         for part in parts:
             own = problem if len(part) == len(good) else part_of(problem, part)
-            yield draw_gibbs(own, good[part], sampler, chains, draws, seed, bar.update)
+            raw = draw_gibbs(own, good[part], sampler, chains, draws, seed, bar.update)
+            yield _weighed(call, good[part], _handed_over(call, good[part], raw))
+
+
+def _weighed(call: Call, pixels: np.ndarray, raw: Raw) -> Raw:
+    """The evidence anew where its stated error is too large: long ridges, which no box around the draws resolves."""
+    # of few draws every error is large
+    poor = np.flatnonzero(raw.log_evidence_error > POOR * max(FULL / (call.chains * call.draws), 1) ** 0.5)
+    if len(poor):
+        drawn = Parameters(*(x[..., poor] for x in raw.parameters))
+        value, error = bridged_evidence(call.model, call.measurement, call.found, pixels[poor], drawn, call.seed)
+        better = error < raw.log_evidence_error[poor]
+        raw.log_evidence[poor[better]], raw.log_evidence_error[poor[better]] = value[better], error[better]
+    return raw
+
+
+def _handed_over(call: Call, pixels: np.ndarray, raw: Raw) -> Raw:
+    """The draws of ``Gibbs``, where its chains do not agree those of its fallback."""
+    sampler, failed = call.sampler, np.flatnonzero(~raw.converged)
+    if not isinstance(sampler, Gibbs) or sampler.fallback is None or len(failed) == 0:
+        return raw
+    other = replace(sampler.fallback, evidence=sampler.evidence)
+    own = draw_ensemble(call.model, call.measurement, other, call.chains, call.draws, call.seed, False, pixels[failed],
+                        call.found)  # fmt: skip
+    own = own._replace(parameters=_aligned(own.parameters, call.found, pixels[failed]))
+
+    def put(old: np.ndarray | None, new: np.ndarray | None) -> None:
+        if old is not None:
+            old[..., failed] = new
+
+    for old, new in zip((*raw.parameters, *raw[1:]), (*own.parameters, *own[1:]), strict=True):
+        put(old, new)
+    return raw
 
 
 def _aligned(parameters: Parameters, found: Fit, good: np.ndarray) -> Parameters:

@@ -23,6 +23,7 @@ from ...noise import InferredNoise, KnownNoise
 from ...records import Fit, Measurement, Parameters
 from ...statistics import Statistics
 from ...threads import each
+from ..diagnostics import diagnose
 from ..raw import Raw
 from . import kernel
 from .evidence import MOST_DRAWS, Given, log_evidence, unavailable
@@ -35,8 +36,9 @@ __all__ = ["Problem", "draw_gibbs", "part_of", "problem_of"]
 
 BLOCKS, FEW = (16, 512), 128  # numbers of pixels for which code is compiled; up to FEW pixels take small ones
 BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
-MORE = (4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
+MORE = (2, 4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
+NEAR = 1.7  # times the effective draws that are asked for: where batches find fewer, they are counted more exactly
 EVIDENCE_BLOCK = 32  # pixels
 PURPOSES = 8  # streams of a pixel and chain that one attempt may use
 SPREAD = 1.5  # standard deviations by which the chains are moved apart at the start
@@ -45,6 +47,7 @@ SPREAD = 1.5  # standard deviations by which the chains are moved apart at the s
 class Problem(NamedTuple):
     """What is drawn from, on the host: statistics by pixels, and the fit that the chains begin at."""
 
+    model: Model
     plan: Plan
     balanced: bool
     statistics: Statistics
@@ -84,7 +87,7 @@ def problem_of(model: Model, measurement: Measurement, fit: Fit, good: np.ndarra
     if fit.gain is not None:
         values["gain"] = np.asarray(fit.gain).reshape(-1)[good]
     usable, balanced = judge_states(np.asarray(statistics.illumination), dtype)
-    return Problem(known, balanced and bool(usable.all()), statistics, values, dtype)
+    return Problem(model, known, balanced and bool(usable.all()), statistics, values, dtype)
 
 
 def part_of(problem: Problem, part: np.ndarray) -> Problem:
@@ -228,6 +231,14 @@ def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     return r_hat.max(axis=0), effective.min(axis=0)
 
 
+def _judged(model: Model, store: _Chains, pixels: np.ndarray) -> np.ndarray:
+    """Least effective draws of some pixels by the sum of all autocorrelations: slower than batches, and longer ones."""
+    gain, precision = (None if x is None else x[..., pixels] for x in (store.gain, store.precision))
+    sigma = None if precision is None else precision**-0.5
+    status = np.zeros(len(pixels), np.int32)
+    return diagnose(model, Parameters(*store.parameters[..., pixels]), gain, sigma, status).worst_ess
+
+
 def _run(
     problem: Problem, store: _Chains, pixels: np.ndarray, numbers: np.ndarray, chains: int, sampler: Gibbs, thin: int,
     seed: int, attempt: int, done: Callable[[int], Any],
@@ -243,11 +254,8 @@ def _run(
         stream = begin(seed, numbers[index], chains, PURPOSES * attempt)
         data, reference = jax.tree.map(jnp.asarray, _observed(problem, index)), _reference(problem, index)
         state = _start(problem, index, chains, numbers[index], seed, attempt)
-        centre_state = State(_point(problem, index, 1), state.gain, state.precision[:1])
-        centre = jnp.stack(
-            [jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, centre_state.point,
-                                                                           centre_state.precision)]
-        )  # fmt: skip
+        first = jax.tree.map(lambda x: x[:1], state)._replace(point=_point(problem, index, 1))
+        centre = jnp.stack([jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, first)])
         stream = jax.tree.map(jnp.asarray, stream)
         run = (problem.plan, problem.balanced)
         warm = -(-sampler.warmup // store.length)
@@ -293,22 +301,22 @@ def draw_gibbs(
     """Draws of all pixels of a problem; ``numbers`` are their flat places in the frame, which choose random numbers."""
     known, count = problem.plan, len(numbers)
     store = _Chains(problem, chains, draws, count)
-    invariants = len(kernel.invariants(known, _point(problem, np.zeros(1, int), 1), jnp.ones((1, 1))))
+    invariants = len(kernel.invariants(known, _start(problem, np.zeros(1, int), 1, numbers[:1], seed, 0)))
     store.sums = np.zeros((store.batches, 2, invariants, chains, count))
     pixels = np.arange(count)
     # few draws cannot reach the number asked for, and their R-hat scatters
     enough, largest = min(sampler.effective, 0.2 * chains * draws), LARGEST_R + 2 / np.sqrt(chains * draws)
     # the number from so many batches is uncertain: twice its standard error
     surely = min(enough * (1 + 2 * (2 / (chains * store.batches)) ** 0.5), 0.25 * chains * draws)
+    r_hat, effective = np.empty(count), np.empty(count)
     for attempt, more in enumerate((1, *MORE)):
         _run(problem, store, pixels, numbers, chains, sampler, sampler.thin * more, seed, attempt, done)
-        if known.noise == "frame":
+        r_hat[pixels], effective[pixels] = convergence(store.sums[..., pixels], store.length)
+        near = pixels[effective[pixels] < NEAR * enough]
+        effective[near] = np.minimum(effective[near], _judged(problem.model, store, near))
+        pixels = pixels[(r_hat[pixels] > largest) | (effective[pixels] < surely)]
+        if known.noise == "frame" or len(pixels) == 0:
             break
-        r_hat, effective = convergence(store.sums[..., pixels], store.length)
-        pixels = pixels[(r_hat > largest) | (effective < surely)]
-        if len(pixels) == 0:
-            break
-    r_hat, effective = convergence(store.sums, store.length)
     converged = (r_hat <= largest) & (effective >= enough)
     evidence = np.full((2, count), np.nan)
     if sampler.evidence and unavailable(known) is None:

@@ -32,8 +32,9 @@ class Batch(NamedTuple):
     sums: Any
 
 
-def invariants(plan: Plan, point: Point, precision: Any) -> list[Any]:
-    """Functions of a state that are the same for all parameter sets of one matrix."""
+def invariants(plan: Plan, state: State) -> list[Any]:
+    """Functions of a state that are the same for all parameter sets of one matrix, those that diagnostics judge by."""
+    point = state.point
     (c0, s0), (c1, s1), *_ = point
     d = 2 * s0 * c0
     found = [jnp.abs(d), d * c1, d * s1] if {0, 1} & set(plan.free) else []
@@ -43,8 +44,14 @@ def invariants(plan: Plan, point: Point, precision: Any) -> list[Any]:
             found += q
         else:  # the other sign of q is the other sign of the gain
             found += [q[i] * q[j] for i in range(4) for j in range(i, 4) if (i, j) != (3, 3)]
+    if plan.gain != "unit":
+        re, im = state.gain
+        square = jnp.maximum(re * re + im * im, 1e-30)
+        found += [(re * re - im * im) / square, 2 * re * im / square]
+        if plan.gain == "complex":
+            found.append(0.5 * jnp.log(square))
     if plan.noise != "known":
-        found.append(jnp.log(precision))
+        found.append(jnp.log(state.precision))
     return found
 
 
@@ -106,7 +113,7 @@ def advance(
     def step(carry: Any, _: Any) -> Any:
         state, stream, sums = carry
         state, stream = jax.lax.fori_loop(0, thin, one, (state, stream))
-        found, shape = invariants(plan, state.point, state.precision), state.precision.shape
+        found, shape = invariants(plan, state), state.precision.shape
         off = jnp.stack([jnp.broadcast_to(x, shape) - c for x, c in zip(found, centre, strict=True)])
         parameters, sign = _aligned(plan, reference, state.point)
         gain = None if plan.gain == "unit" else jnp.stack([sign * state.gain[0], sign * state.gain[1]])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...checks import integer
+from ...checks import integer, one_of_types
+from ..ensemble import Ensemble
 
 __all__ = ["Gibbs"]
 
@@ -23,9 +24,10 @@ class Gibbs:
     warmup: sweeps before the first draw, >= 0; chains begin around the most probable parameters.
     thin: sweeps for each draw that is kept, >= 1.
     effective: effective draws that each invariant of each pixel must reach, >= 0 (at most a fifth of the draws); where
-        it does not, that pixel is drawn again with 4, then 16 times as many sweeps for a draw, and then flagged
+        it does not, that pixel is drawn again with 2, 4, then 16 times as many sweeps for a draw, and then flagged
         ``Status.NOT_CONVERGED``.
     evidence: whether to compute the log evidence.
+    fallback: draws the pixels anew that would be flagged, some seconds each; None: they are flagged.
 
     Raises
     ------
@@ -39,9 +41,12 @@ class Gibbs:
     thin: int = 1
     effective: int = 400
     evidence: bool = True
+    fallback: Ensemble | None = None
 
     def __post_init__(self) -> None:
         for name, low in (("warmup", 0), ("thin", 1), ("effective", 0)):
             object.__setattr__(self, name, integer(name, getattr(self, name), low=low))
         if not isinstance(self.evidence, bool):
             raise TypeError(f"evidence must be True or False, got {type(self.evidence).__name__}.")
+        if self.fallback is not None:
+            one_of_types("fallback", self.fallback, (Ensemble,), "pass Ensemble(...), or None.")

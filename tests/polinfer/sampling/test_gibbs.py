@@ -28,6 +28,8 @@ from polinfer import (
     sample,
     simulate,
 )  # fmt: skip
+from polinfer.sampling import verb
+from polinfer.sampling.gibbs import engine
 from polinfer.sampling.invariants import invariants
 
 from ..scenes import BALANCED, UNBALANCED
@@ -190,3 +192,38 @@ def test_what_it_cannot_draw_from_is_named():
     with pytest.raises(TypeError, match="sampler must be"):
         sample(Model(), data, sampler="gibbs")
     assert Ensemble().walkers == 32
+
+
+def test_both_routes_to_the_evidence_agree_and_ridges_take_the_one_that_resolves_them(monkeypatch):
+    model = Model(gain=ComplexGain(1.0))
+    truth = Parameters(np.array([0.4, 0.05, 0.999]), *(np.full(3, x) for x in (0.5, 1.2, 0.4, 0.2)))
+    data = simulate(model, truth, BALANCED, 0.02, rng=2)
+    by_default = sample(model, data, draws=500, rng=1)
+    assert np.all(by_default.log_evidence_error < 0.02)
+    monkeypatch.setattr(verb, "POOR", np.inf)
+    conditionals = sample(model, data, draws=500, rng=1)
+    assert conditionals.log_evidence_error[2] > 0.1
+    monkeypatch.setattr(verb, "POOR", 0.0)
+    bridged = sample(model, data, draws=500, rng=2)
+    for other in (conditionals, by_default):
+        error = np.hypot(bridged.log_evidence_error, other.log_evidence_error)
+        assert np.all(np.abs(bridged.log_evidence - other.log_evidence) < 4 * error)
+    # the draws are the same whatever the evidence comes from
+    np.testing.assert_array_equal(by_default.parameters.retardance, conditionals.parameters.retardance)
+
+
+def test_pixels_whose_chains_do_not_agree_go_to_the_fallback(monkeypatch):
+    data = simulate(Model(), Parameters(*(np.full(2, x) for x in (0.3, 0.5, 1.1, 0.4, 0.4))), BALANCED, 0.05, rng=2)
+    other = Ensemble(walkers=20, warmup=40, thin=5, evidence=False)
+    expected = sample(Model(), data, other, draws=100, rng=1)
+    monkeypatch.setattr(engine, "MORE", ())
+    monkeypatch.setattr(engine, "LARGEST_R", -1.0)
+    flagged = sample(Model(), data, Gibbs(evidence=False), draws=100, rng=1)
+    assert np.all(flagged.status & int(Status.NOT_CONVERGED))
+    found = sample(Model(), data, Gibbs(evidence=False, fallback=other), draws=100, rng=1)
+    np.testing.assert_array_equal(found.parameters.retardance, expected.parameters.retardance)
+    assert np.array_equal(found.status, expected.status)
+    with pytest.raises(ValueError, match="fallback, but model infers one sigma of the frame"):
+        sample(Model(noise=InferredNoise(2.0, 0.01, "frame")), replace(data, sigma=None), Gibbs(fallback=other))
+    with pytest.raises(TypeError, match="fallback must be"):
+        Gibbs(fallback=True)
