@@ -40,6 +40,7 @@ from polinfer.sampling.invariants import invariants
 PIXELS, EFFECTIVE, CHAINS, DRAWS = 972, 1000, 4, 1000
 SIGMAS = (0.005, 0.02, 0.1, 0.4)
 GAINS = {"unit": (None, 1.0), "complex": (ComplexGain(1.0), 2.0)}  # with the bar, seconds
+AGREEMENT = ((0.05, None), (0.4, None), (0.4, ComplexGain(1.0)))
 SPREAD_D = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9, 0.97, 0.999])
 
 
@@ -140,7 +141,7 @@ def agreement(results: Results, pixels: int) -> None:
     """Means of invariants and of their squares by both samplers, six chains each: Welch's test in every pixel."""
     states, values = scenes.balanced_states(), []
     sampler = Ensemble(warmup=100, thin=20, evidence=False)
-    for sigma, gain in ((0.05, None), (0.4, None), (0.4, ComplexGain(1.0))):
+    for sigma, gain in AGREEMENT:
         model = Model(gain=gain)
         truth = scenes.from_priors(model, pixels, np.random.default_rng(7))
         data = scenes.measure(model, truth, states, sigma, rng=8)
