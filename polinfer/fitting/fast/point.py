@@ -37,8 +37,8 @@ class Point(NamedTuple):
 
 
 def dot(left: Vector, right: Vector) -> Any:
-    """Scalar product; components that are None are 0."""
-    return sum((a * b for a, b in zip(left, right, strict=True) if a is not None and b is not None), start=ZERO)
+    """Scalar product."""
+    return sum((a * b for a, b in zip(left, right, strict=True)), start=ZERO)
 
 
 def unit(x: Any, y: Any) -> Pair:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import i0e, logsumexp
 
 from ...fitting.fast.overlap import Pauli, coefficients, imaginary, quadratic_forms, turned
-from ...fitting.fast.point import polariser_vector, retarder_vector
+from ...fitting.fast.point import dot, polariser_vector, retarder_vector
 from ...fitting.fast.priors import COPIES
 from .plan import Any1D, Plan, conjugate, normal
 
@@ -82,10 +82,7 @@ def _stokes(plan: Plan, given: Given, q: list[Any]) -> list[Any] | None:
     if not plan.retarder_first:
         return [given.power.z[0], given.power.x[0]]
     forms = quadratic_forms(given.power)
-    return [
-        sum(q[i] * sum(row[j] * q[j] for j in range(4) if row[j] is not None) for i, row in enumerate(form))
-        for form in forms
-    ]
+    return [dot(q, [dot(row, q) for row in form]) for form in forms]
 
 
 def _log_conditional(plan: Plan, given: Given, retarder: np.ndarray, gain: np.ndarray | None) -> np.ndarray:

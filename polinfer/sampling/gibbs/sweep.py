@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from ...fitting.fast.climb import moved
 from ...fitting.fast.data import times
+from ...fitting.fast.known import ZERO, Known
 from ...fitting.fast.likelihoods import square
 from ...fitting.fast.overlap import Pauli, coefficients, imaginary, quadratic_forms, turned
 from ...fitting.fast.point import Pair, Point, dot, matrix, polariser_vector, retarder_vector
@@ -185,7 +186,7 @@ def _retarder(
         (c, s), (x, y), *_ = point
         z_form, x_form = quadratic_forms(data.power)
         scale = -2 * c * s * weight
-        form = [[scale * _difference(x, p, y, q) for p, q in zip(*rows, strict=True)]
+        form = [[scale * (x * p - y * q) for p, q in zip(*rows, strict=True)]
                 for rows in zip(z_form, x_form, strict=True)]  # fmt: skip
     pairs = list(point)
     for index in (4, 3, 2):
@@ -193,35 +194,22 @@ def _retarder(
             continue
         (c2, s2), (c3, s3), (c4, s4) = pairs[2:]
         # q = rest + cos y a + sin y b
-        one = jnp.ones_like(c2)
         if index == 4:
-            rest, a, b = [c2, s2 * c3, None, None], [None, None, s2 * s3, None], [None, None, None, s2 * s3]
+            rest, a, b = [c2, s2 * c3, ZERO, ZERO], [ZERO, ZERO, s2 * s3, ZERO], [ZERO, ZERO, ZERO, s2 * s3]
         elif index == 3:
-            rest, a, b = [c2, None, None, None], [None, s2, None, None], [None, None, s2 * c4, s2 * s4]
+            rest, a, b = [c2, ZERO, ZERO, ZERO], [ZERO, s2, ZERO, ZERO], [ZERO, ZERO, s2 * c4, s2 * s4]
         else:
-            rest, a, b = [None] * 4, [one, None, None, None], [None, c3, s3 * c4, s3 * s4]
+            rest, a, b = [ZERO] * 4, [Known(1.0), ZERO, ZERO, ZERO], [ZERO, c3, s3 * c4, s3 * s4]
         first, other = dot(w, a), dot(w, b)
         second = None
         if form is not None:
-            fa, fb = ([_dot_or_zero(row, vector) for row in form] for vector in (a, b))
+            fa, fb = ([dot(row, vector) for row in form] for vector in (a, b))
             if index != 2:
                 first, other = first + 2 * dot(rest, fa), other + 2 * dot(rest, fb)
             second = (0.5 * (dot(a, fa) - dot(b, fb)), dot(a, fb))
         first, other, second = _kept(data.one, (first, other, second))
         pairs[index] = _kept(data.one, _angle(plan, index, first, other, second, pairs[index], random))
     return Point(*pairs)
-
-
-def _difference(x: Any, p: Any, y: Any, q: Any) -> Any:
-    """``x p - y q``; None is 0."""
-    total: Any = 0.0
-    total = total if p is None else total + x * p
-    return total if q is None else total - y * q
-
-
-def _dot_or_zero(row: list[Any], vector: list[Any]) -> Any:
-    terms = [r * v for r, v in zip(row, vector, strict=True) if v is not None]
-    return sum(terms[1:], start=terms[0])
 
 
 def _exchange(plan: Plan, copy: Any, behind: Any, point: Point, random: Random) -> Point:

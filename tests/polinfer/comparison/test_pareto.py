@@ -73,7 +73,7 @@ def conjugate(states, sigma, draws, rng, weight=None):
     fixed = {"diattenuation": 0.0, "retardance": 0.0}
     model = Model(gain=ComplexGain(scale), fixed=fixed)
     return SimpleNamespace(
-        model=model, measurement=data, parameters=Parameters(*[zero] * 5), gain=gain, sigma=None
+        model=model, measurement=data, parameters=Parameters(*[zero] * 5), gain=gain, sigma=None, tilt=None
     ), expected
 
 
