@@ -52,23 +52,24 @@ class DemoResult:
         return float(np.nansum(values)), int(freedom.sum()), int(np.count_nonzero(freedom))
 
 
-def demo_scene(seed: int) -> Scene:
-    """The demo's scene: a lesion behind 547 fibrelets, seen by a 200 x 200 camera of 8 bits.
+def demo_scene(seed: int, grid: tuple[int, int] = GRID) -> Scene:
+    """The demo's scene: a lesion of ``grid`` points behind 547 fibrelets, seen by a 200 x 200 camera of 8 bits.
 
     The bench is not what the recovery believes: the sample is finer than the calibration points, every defocus is
     0.3 % longer than stated, and the phase steps err by 5 mrad.
     """
     return Scene(
         fibre.Bundle.hexagonal(rng=seed),
-        phantoms.lesion(GRID, rng=seed),
+        phantoms.lesion(grid, rng=seed),
         focus_error=3e-3,
         step_error=5e-3,
         sample_oversampling=2,
     )
 
 
-def run_demo(folder: str | Path, seed: int = 0, progress: bool = False) -> DemoResult:
-    """Simulate, capture, retrieve, recover, reconstruct and fit; every record is saved in ``folder``.
+def run_demo(folder: str | Path, seed: int = 0, progress: bool = False, grid: tuple[int, int] = GRID) -> DemoResult:
+    """Simulate, capture, retrieve, recover, reconstruct and fit a sample of ``grid`` points; every record is saved in
+    ``folder``.
 
     Captures already complete in ``folder`` are not taken again; everything later is made anew and overwritten.
     """
@@ -87,11 +88,11 @@ def run_demo(folder: str | Path, seed: int = 0, progress: bool = False) -> DemoR
         files.append(fibre.save(record, folder / name, overwrite=True))
 
     with stage("simulated bench"):
-        scene = demo_scene(seed)
+        scene = demo_scene(seed, grid)
         bench = SimulatedBench(scene, rng=seed)
     keep(scene.phantom, "phantom.nc")
     with stage("calibration capture"):
-        calibration = calibrate(bench, CalibrationPlan(GRID, reference_every=24), folder / "calibration", progress)
+        calibration = calibrate(bench, CalibrationPlan(grid, reference_every=24), folder / "calibration", progress)
     with stage("sample capture"):
         recording = capture(bench, SamplePlan(), folder / "sample", progress)
     method = fibre.GerchbergSaxton()

@@ -16,6 +16,7 @@ def run(name, folder):
     settings = os.environ | {
         "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",  # compiling is most of their time
     }
     command = [sys.executable, "-W", "error", str(ROOT / "examples" / name), str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, env=settings, check=False)

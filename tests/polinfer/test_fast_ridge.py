@@ -79,6 +79,7 @@ def polarised(ordering, n, sigma, seed):
     return truth, matrices @ BALANCED + sigma / 2**0.5 * (noise[0] + 1j * noise[1])
 
 
+@pytest.mark.slow  # two precisions to compile
 def test_single_precision_is_no_worse_than_double_behind_a_perfect_polariser_at_a_signal_of_100000():
     model = Model(gain=ComplexGain(1.0))
     _, response = polarised(model.ordering, 24, 1e-5, 3)

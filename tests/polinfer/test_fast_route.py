@@ -50,7 +50,7 @@ def gaussian(result, widest):
     return (std.max(axis=0) < widest) & (result.status & int(Status.AT_EDGE) == 0)
 
 
-SLOW = ("pure polariser", "known polariser")  # to compile
+SLOW = ("pure polariser", "known polariser", "pure retarder")  # to compile
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,9 @@ def test_the_evidence_is_that_of_importance_sampling_where_the_density_is_a_gaus
     np.testing.assert_allclose(fast.log_evidence[pixels], expected, atol=0.1)
 
 
-@pytest.mark.parametrize("fixed", [{"diattenuation": 0.4}, {"retardance_angle": 0.3}])
+@pytest.mark.parametrize(
+    "fixed", [{"diattenuation": 0.4}, pytest.param({"retardance_angle": 0.3}, marks=pytest.mark.slow)]
+)
 def test_fixed_values_are_kept_where_other_starts_are_tried(fixed):
     model = Model(gain=ComplexGain(0.8), **with_priors(**fixed))
     data = simulate(model, drawn(model, 64, np.random.default_rng(17)), UNBALANCED, 0.2, rng=1)

@@ -160,6 +160,7 @@ def test_log_evidence_with_unknown_noise_is_the_integral_over_the_ranges():
     assert float(fit(model, measurement).log_evidence) == pytest.approx(np.log(density) + top, abs=0.1)
 
 
+@pytest.mark.slow  # two models to compile
 def test_a_residual_beyond_what_the_prior_of_sigma_expects_is_a_bad_fit():
     truth = everywhere(200, (0.4, 0.5, 1.3, 0.6, 0.2))
     sure, unsure = InferredNoise(50.0, 50 * 0.01**2, "pixel"), InferredNoise(0.1, 0.1 * 0.01**2, "pixel")

@@ -87,9 +87,9 @@ def test_taking_the_tilt_out_leaves_every_likelihood(u, missing):
     ("ordering", "gain", "u"),
     [
         ("retarder_first", "none", UNBALANCED),
-        ("retarder_first", "complex", BALANCED),
-        ("polariser_first", "phase", BALANCED),
-        ("polariser_first", "complex", UNBALANCED),
+        pytest.param("retarder_first", "complex", BALANCED, marks=pytest.mark.slow),
+        pytest.param("polariser_first", "phase", BALANCED, marks=pytest.mark.slow),
+        pytest.param("polariser_first", "complex", UNBALANCED, marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_by_the_phase_are_those_of_automatic_differentiation(ordering, gain, u):
@@ -156,7 +156,7 @@ def test_masked_and_broken_pixels_do_not_count():
     assert np.isnan(result.tilt.response[3, 12]).all()
 
 
-@pytest.mark.parametrize("gain", ["phase", "complex"])
+@pytest.mark.parametrize("gain", [pytest.param("phase", marks=pytest.mark.slow), "complex"])
 def test_a_free_gain_and_the_other_ordering(gain):
     model = Model(ORDERINGS["polariser_first"], gain=GAINS[gain], misalignment=TiltPlane())
     rng = np.random.default_rng(5)
@@ -221,6 +221,7 @@ def test_many_frames_have_a_plane_each():
     np.testing.assert_allclose(fit(TILTED, data, start=both).tilt.coefficients, both.tilt.coefficients, atol=1e-3)
 
 
+@pytest.mark.slow  # tens of thousands of fits
 def test_price_and_width_of_the_tilt_are_those_of_quadrature():
     """The evidence of the frame, integrated over planes on a grid, each with the evidence of its pixels."""
     shape = (4, 5)
@@ -250,6 +251,7 @@ def test_select_says_whether_a_scene_is_misaligned():
         assert polinfer.select(candidates, data).verdict == verdict
 
 
+@pytest.mark.slow  # two precisions to compile
 def test_single_precision_at_a_high_signal_to_noise_ratio():
     truth, phase = plate(diattenuation=0.0), plane(SHAPE, 0.3, 5.0, -7.0)
     data = simulate(Model(), truth, BALANCED, 1e-5, rng=1, tilt=phase)
@@ -261,6 +263,7 @@ def test_single_precision_at_a_high_signal_to_noise_ratio():
     np.testing.assert_allclose(result.tilt.covariance, exact.tilt.covariance, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow  # the general route to compile
 def test_an_ordering_of_ones_own():
     shape, slopes = (6, 8), (0.3, 2.0, -3.0)
     model = Model(Sandwich(), misalignment=TiltPlane(scale=3.0))
@@ -268,8 +271,9 @@ def test_an_ordering_of_ones_own():
     assert np.all(np.abs(deviation(fit(model, data), *slopes)) < 4)
 
 
-@pytest.mark.parametrize("noise", [InferredNoise(2.0, 0.005, "frame"), InferredNoise(2.0, 0.005, "pixel")])
-def test_an_unknown_sigma(noise):
+@pytest.mark.parametrize("scope", ["frame", pytest.param("pixel", marks=pytest.mark.slow)])
+def test_an_unknown_sigma(scope):
+    noise = InferredNoise(2.0, 0.005, scope)
     shape = (8, 9)
     data = simulate(Model(), plate(shape), BALANCED, 0.05, rng=1, tilt=plane(shape, 0.3, 4.0, -3.0))
     result = fit(replace(TILTED, noise=noise), replace(data, sigma=None))

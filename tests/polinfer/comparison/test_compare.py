@@ -147,8 +147,8 @@ def test_select_gives_a_model_that_infers_sigma_data_without_one():
 def draws_like(fit, data, **other):
     """A stand-in for draws: evidences with errors, and one draw repeated."""
     repeated = Parameters(*(np.broadcast_to(x, (2, 50, *x.shape)) for x in fit.parameters))
-    parts = {"model": fit.model, "measurement": data, "parameters": repeated, "status": fit.status, "gain": None, "tilt": None,
-             "sigma": None, "log_evidence": fit.log_evidence,
+    parts = {"model": fit.model, "measurement": data, "parameters": repeated, "status": fit.status, "gain": None,
+             "tilt": None, "sigma": None, "log_evidence": fit.log_evidence,
              "log_evidence_error": np.full(data.shape, 0.1)}  # fmt: skip
     return SimpleNamespace(**(parts | other))
 

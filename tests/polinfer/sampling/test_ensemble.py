@@ -111,7 +111,13 @@ def test_shares_of_copies_and_turns_add_up_to_one(gain):
         assert abs(total - 1) < 1e-12
 
 
-@pytest.mark.parametrize("model", [Model(**with_priors()), Model(gain=PhaseGain(), **with_priors(diattenuation=0.4))])
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param(Model(**with_priors()), marks=pytest.mark.slow),
+        Model(gain=PhaseGain(), **with_priors(diattenuation=0.4)),
+    ],
+)
 def test_without_data_the_draws_follow_the_prior(model):
     data = Measurement(BALANCED, np.zeros((1, 2, 3)), sigma=1e4)
     sampler = Ensemble(walkers=40, warmup=100, thin=8)

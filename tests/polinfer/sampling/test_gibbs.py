@@ -56,8 +56,8 @@ def prior_draws(model: Model, count: int, rng: np.random.Generator) -> Parameter
     return Parameters(*(model.priors[name].sample(rng, (count,)) for name in Parameters._fields))
 
 
-# the general route of fit is compiled for two of them; conditionals of the third are in "priors, phase", too
-SLOW = {"sigma of every pixel", "one state", "second harmonics"}
+# each takes half a minute, most of it to compile
+SLOW = {"sigma of every pixel", "one state", "second harmonics", "priors, phase"}
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in CASES])
@@ -194,6 +194,7 @@ def test_what_it_cannot_draw_from_is_named():
     assert Ensemble().walkers == 32
 
 
+@pytest.mark.slow  # three runs
 def test_both_routes_to_the_evidence_agree_and_ridges_take_the_one_that_resolves_them(monkeypatch):
     model = Model(gain=ComplexGain(1.0))
     truth = Parameters(np.array([0.4, 0.05, 0.999]), *(np.full(3, x) for x in (0.5, 1.2, 0.4, 0.2)))
