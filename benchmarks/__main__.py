@@ -24,6 +24,7 @@ ALL = (
     "texture",
     "contrast",
     "cohort_contrast",
+    "accelerator",
 )
 
 

@@ -48,17 +48,17 @@ def median_seconds(function: Callable[[], Any], repeats: int = 5) -> float:
     return float(np.median([seconds(function) for _ in range(repeats)]))
 
 
-def in_fresh_process(function: Callable[..., Any], *arguments: Any, double: bool) -> Any:
+def in_fresh_process(function: Callable[..., Any], *arguments: Any, double: bool, **variables: str) -> Any:
     """``function(*arguments)`` in a process of its own, without compiled code, in one precision of JAX.
 
-    Arguments and result travel as JSON.
+    Arguments and result travel as JSON; ``variables`` are set in its environment.
     """
     code = (
         f"import json\nfrom {function.__module__} import {function.__name__} as f\n"
         f"print('\\n' + json.dumps(f(*json.loads({json.dumps(json.dumps(arguments))}))))"
     )
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-    environment["JAX_ENABLE_X64"] = str(int(double))
+    environment |= {"JAX_ENABLE_X64": str(int(double)), **variables}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[1]
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...records import Parameters
 from ...statistics import Statistics
-from ...threads import each
+from ...threads import each, piece
 from . import kernel
 from .climb import moved
 from .describe import CONVERGED, DOUBTFUL, NON_FINITE, ROUGH, ROWS, WIDE, rows
@@ -27,10 +27,12 @@ __all__ = ["Responses", "Summed", "pairs_of", "solve_frame"]
 
 # pixels for which code is compiled: in small frames, which all cores shall share, and in large ones
 BLOCKS = (512, 4096)
+ACCELERATOR = (1 << 13, 1 << 18)  # the same where thousands of threads work side by side
 # Newton steps of the first pass; of the others at first, and for pixels that need more; and of the last
 FIRST, SOME, MOST, LAST = 3, 10, 60, 500
 ALONE = 2048  # pixels up to which threads cost more than they bring
 LOOKS = 1 << 16  # climbs from other starts that are in memory at once
+STARTS = 8  # other starts of a pixel, at most
 POLARISER = 0.9  # |D| from which on a free phase leaves the angle of the retarder about the same axis open
 TURNS = [k * pi / 6 for k in range(1, 6)]  # about that axis; pi changes the sign of J
 
@@ -120,7 +122,8 @@ def _pass(
 ) -> None:  # fmt: skip
     """Rows and flags of the pixels ``index`` (None: all), from a start or the closed form, into ``out``."""
     count = frame.pixels if index is None else len(index)
-    size = BLOCKS[frame.pixels > BLOCKS[1]]  # one for all passes: to compile takes seconds
+    large = frame.pixels > piece(BLOCKS[1], ACCELERATOR[0])
+    size = piece(BLOCKS[large], ACCELERATOR[large])  # one for all passes: to compile takes seconds
     nothing = kernel.no_start(size, frame.dtype)
 
     def work(begin: int) -> None:
@@ -173,9 +176,6 @@ def _alternatives(points: np.ndarray) -> list[np.ndarray]:
         changed(retardance=(0.05, -edge)),
         changed(diattenuation=(0.85, 0.527)),
     ]
-
-
-STARTS = 8  # that many at most
 
 
 def _copies(scene: Scene, points: np.ndarray) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ from ...model import Model
 from ...noise import InferredNoise, KnownNoise
 from ...records import Fit, Measurement, Parameters
 from ...statistics import Statistics
-from ...threads import each
+from ...threads import each, piece
 from ..diagnostics import diagnose
 from ..raw import Raw
 from . import kernel
@@ -35,6 +35,7 @@ from .sweep import Observed, State
 __all__ = ["Problem", "draw_gibbs", "part_of", "problem_of"]
 
 BLOCKS, FEW = (16, 512), 128  # numbers of pixels for which code is compiled; up to FEW pixels take small ones
+ACCELERATOR = (128, 1024, 1 << 14)  # the same where thousands of threads work side by side
 BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
 MORE = (2, 4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
@@ -245,7 +246,9 @@ def _run(
 ) -> None:  # fmt: skip
     """Draw for the pixels with the places ``pixels`` and the numbers ``numbers`` in the frame."""
     frame = problem.plan.noise == "frame"
-    size = len(pixels) if frame else BLOCKS[0] if len(pixels) <= FEW else BLOCKS[1]
+    sizes = BLOCKS if piece(0, 1) == 0 else ACCELERATOR
+    small = [s for s in sizes[:-1] if len(pixels) <= max(s, FEW)]
+    size = len(pixels) if frame else small[0] if small else sizes[-1]
 
     def block(begin_at: int) -> None:
         own = pixels[begin_at : begin_at + size]
