@@ -54,7 +54,8 @@ class Diversity:
     ----------
     intensities: real (*B, m, y, x), >= 0 up to noise. masks: complex (m, y, x) on the frequencies of ``fftfreq``,
     modulus at most 1. wavelength, pixel_size: metres. variance: real (*B, m, y, x) of the intensities, > 0, infinite
-    where a pixel says nothing (saturated); None = unknown, all alike.
+    where a pixel says nothing (saturated); None = unknown, all alike. distances: (m,) metres, where the masks are
+    those of a defocus (:func:`Defocus`), for methods that ask; None = other masks.
     """
 
     intensities: np.ndarray = array(("*P", "image", "y", "x"), "photo-electrons/s")
@@ -62,6 +63,7 @@ class Diversity:
     wavelength: float = setting()
     pixel_size: float = setting()
     variance: np.ndarray | None = array(("*P", "image", "y", "x"), "(photo-electrons/s)^2", default=None)
+    distances: np.ndarray | None = array(("image",), "m", default=None)
 
     def __post_init__(self) -> None:
         intensities = real_array("intensities", self.intensities, trailing=(None, None, None), finite=True)
@@ -77,6 +79,9 @@ class Diversity:
                     f"variance must have the shape of intensities {intensities.shape}, got {variance.shape}."
                 )
             object.__setattr__(self, "variance", variance)
+        if self.distances is not None:
+            distances = real_array("distances", self.distances, shape=(len(masks),), finite=True)
+            object.__setattr__(self, "distances", distances)
 
 
 def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None) -> Diversity:
@@ -88,7 +93,7 @@ def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: flo
     intensities = real_array("intensities", intensities, trailing=(None, None, None), finite=True)
     distances = real_array("distances", distances, shape=(intensities.shape[-3],), finite=True)
     masks = transfer_function(intensities.shape[-2:], distances, wavelength, pixel_size)
-    return Diversity(intensities, masks, wavelength, pixel_size, variance)
+    return Diversity(intensities, masks, wavelength, pixel_size, variance, distances)
 
 
 @dataclass(frozen=True)

@@ -16,29 +16,48 @@ from tqdm import tqdm
 from fibre.records import Diversity, RetrievalStatus, Retrieved
 from polinfer.checks import one_of_types
 
-__all__ = ["RetrievalMethod", "Solution", "misfit", "retrieve"]
+__all__ = ["RetrievalMethod", "Solution", "Stack", "misfit", "retrieve"]
 
 
 class RetrievalMethod(ABC):
     """A method of phase retrieval: a frozen object of settings with one function."""
 
     @abstractmethod
-    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray, noise: np.ndarray) -> Solution:
-        """Fields of a small batch.
+    def solve(self, stack: Stack) -> Solution:
+        """Fields of a small batch."""
 
-        ``amplitudes`` float32 (b, m, y, x), square roots of the images; ``weights`` float32, the same shape, inverse
-        variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable; ``masks`` complex64 (m, y, x);
-        ``noise`` float32 (b), the noise of the amplitudes over the amplitudes (weighted), 0 where it is not known.
-        """
+
+@dataclass(frozen=True)
+class Stack:
+    """What a method is given: the images of a small batch of b fields, checked, in single precision.
+
+    intensities: float32 (b, m, y, x), as measured, so that noise may be negative. variance: float32, the same shape,
+    infinite = unusable, or None = unknown. amplitudes: their square roots, 0 for negative ones. weights: inverse
+    variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable. noise: (b,), the noise of the
+    amplitudes over the amplitudes (weighted), 0 where it is not known. masks: complex64 (m, y, x). distances: (m,)
+    metres, or None where the masks are others than defocus. wavelength, pixel_size: metres.
+    """
+
+    intensities: np.ndarray
+    variance: np.ndarray | None
+    amplitudes: np.ndarray
+    weights: np.ndarray
+    noise: np.ndarray
+    masks: np.ndarray
+    distances: np.ndarray | None
+    wavelength: float
+    pixel_size: float
 
 
 @dataclass(frozen=True)
 class Solution:
-    """field: complex64 (b, y, x). converged: bool (b). iterations: int (b)."""
+    """field: complex64 (b, y, x). converged: bool (b). iterations: int (b). variance: float32 (b, y, x) of the complex
+    field, where the method knows better than the floor that :func:`retrieve` states."""
 
     field: np.ndarray
     converged: np.ndarray
     iterations: np.ndarray
+    variance: np.ndarray | None = None
 
 
 def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, progress: bool = False) -> Retrieved:
@@ -78,20 +97,26 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     masks = diversity.masks.astype(np.complex64)
     count = len(intensities)
     field = np.empty((count, height, width), np.complex64)
-    floor = np.empty(count, np.float32)
+    spread = np.empty((count, height, width), np.float32)
     status = np.zeros(count, np.uint8)
     iterations = np.zeros(count, np.int32)
     for start in tqdm(range(0, count, batch), desc="phase retrieval", unit="batch", disable=not progress):
         part = slice(start, min(start + batch, count))
         amplitudes = np.sqrt(np.maximum(intensities[part], 0)).astype(np.float32)
-        weights, best = _weights(amplitudes, None if variance is None else variance[part])
-        found = method.solve(amplitudes, weights, masks, _relative_noise(amplitudes, weights, best))
+        uncertain = None if variance is None else variance[part].astype(np.float32)
+        weights, best = _weights(amplitudes, uncertain)
+        stack = Stack(
+            intensities[part].astype(np.float32), uncertain, amplitudes, weights,
+            _relative_noise(amplitudes, weights, best), masks, diversity.distances, diversity.wavelength,
+            diversity.pixel_size,
+        )  # fmt: skip
+        found = method.solve(stack)
         field[part], iterations[part] = found.field, found.iterations
-        floor[part], misfitted = _noise(found.field, amplitudes, weights, best, masks)
+        floor, misfitted = _noise(found.field, amplitudes, weights, best, masks)
+        spread[part] = floor[:, None, None] if found.variance is None else found.variance
         status[part] = np.where(found.converged, 0, RetrievalStatus.NOT_CONVERGED)
         status[part] |= np.where(misfitted, RetrievalStatus.MISFIT, 0).astype(np.uint8)
     shape = tuple(lead)
-    spread = np.broadcast_to(floor[:, None, None], field.shape)
     return Retrieved(
         field.reshape(*shape, height, width),
         spread.reshape(*shape, height, width),

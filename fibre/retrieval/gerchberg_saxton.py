@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.ndimage
 
-from fibre.retrieval.base import RetrievalMethod, Solution, misfit
+from fibre.retrieval.base import RetrievalMethod, Solution, Stack, misfit
 from polinfer.checks import integer, real_number
 
 __all__ = ["GerchbergSaxton"]
@@ -57,8 +57,9 @@ class GerchbergSaxton(RetrievalMethod):
         integer("restarts", self.restarts, low=0)
         integer("coarsening", self.coarsening, low=1)
 
-    def solve(self, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray, noise: np.ndarray) -> Solution:
+    def solve(self, stack: Stack) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
+        amplitudes, weights, masks, noise = stack.amplitudes, stack.weights, stack.masks, stack.noise
         # the planes' noise keeps the field moving by a few per cent of it, however long one waits
         tolerance = np.asarray(np.maximum(self.tolerance, 0.1 * noise) * (self.tolerance > 0), np.float32)
         settings = (self.iterations, self.averaging)

@@ -75,8 +75,8 @@ class Turned(RetrievalMethod):
 
     inner: RetrievalMethod
 
-    def solve(self, amplitudes, weights, masks, noise):
-        found = self.inner.solve(amplitudes, weights, masks, noise)
+    def solve(self, stack):
+        found = self.inner.solve(stack)
         phase = np.random.default_rng(len(found.field)).uniform(-np.pi, np.pi, (len(found.field), 1, 1))
         return replace(found, field=(found.field * np.exp(1j * phase)).astype(np.complex64))
 
