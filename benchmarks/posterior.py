@@ -121,7 +121,12 @@ def evidence(results: Results, sigmas: tuple[float, ...], kinds: tuple[str, ...]
             oracle = Oracle(type(ordering).__name__, "unit")
             values = [(nested(oracle, r, states, sigma), 0.0) for r in data.response]
         else:
-            values = [importance(model, data, found, pixel, 1) for pixel in range(len(data.response))]
+            # from other draws than those whose evidence is judged
+            start = polinfer.sample(model, data, Gibbs(evidence=False), draws=DRAWS, rng=60).parameters
+            values = [
+                importance(model, data, found, k, 1, Parameters(*(np.asarray(x)[..., k].ravel() for x in start)))
+                for k in range(len(data.response))
+            ]
         expected, error = np.array(values).T
         off = draws.log_evidence - expected
         worst[gain] = max(worst[gain], float(np.abs(off).max()))

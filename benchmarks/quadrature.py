@@ -20,11 +20,11 @@ import numpy as np
 from scipy.special import i0e
 
 from benchmarks.oracle import Oracle
-from polinfer import Fit, Measurement, Model
+from polinfer import Fit, Measurement, Model, Parameters
 from polinfer.fitting.generic import prepare
 from polinfer.model import as_device
 from polinfer.sampling.bridge import defended, fit_mixture
-from polinfer.sampling.charts import Target
+from polinfer.sampling.charts import Target, centre_of, into_chart
 from polinfer.sampling.ensemble import _start, _temper
 
 __all__ = ["importance", "nested"]
@@ -122,8 +122,15 @@ def _interval(mode: np.ndarray, reach: np.ndarray, end: float) -> tuple[np.ndarr
     return np.maximum(0.5 * (high - low), 1e-300), low
 
 
-def importance(model: Model, data: Measurement, found: Fit, pixel: int, seed: int) -> tuple[float, float]:
-    """Log evidence of one pixel and its standard error; ``found`` is where the search for the mixture begins."""
+def importance(
+    model: Model, data: Measurement, found: Fit, pixel: int, seed: int, draws: Parameters | None = None
+) -> tuple[float, float]:
+    """Log evidence of one pixel and its standard error.
+
+    ``found``, and of ``draws`` (n,) those that are given, are where the search for the mixture begins. That does not
+    bias the answer: whatever the mixture, the mean weight of its points is the integral. A part that no point reaches
+    makes it too small, unseen by its error; long ridges have such parts, unless draws show the way.
+    """
     prepared = prepare(model, data, model.noise.integrated)
     statistics = as_device(jax.tree.map(lambda x: x[0], prepared.pooled.take(np.array([pixel]))), np.complex128)
     centre, covariance = _start(model, found, pixel)
@@ -131,13 +138,18 @@ def importance(model: Model, data: Measurement, found: Fit, pixel: int, seed: in
     root = np.linalg.cholesky(covariance)
     mixture: Any = (np.full(2, 0.5), np.stack([centre] * 2), np.stack([root, 2 * root]))
     every: list[np.ndarray] = []
+    if draws is not None:
+        every = [into_chart(model, centre, centre_of(model, draws)[:: max(len(draws.diattenuation) // POINTS, 1)], rng)]
+        mixture = fit_mixture(every[0], 12, rng)
     for _ in range(ROUNDS):
         proposal = defended(target, mixture, 0.1)
         points, logs = _weighed(target, proposal, rng)
         # levelled weights: a few heavy points must not pull the mixture to themselves
         weight = np.exp(_temper(logs) - _temper(logs).max())
         every.append(points[rng.choice(len(points), size=len(points) // 8, p=weight / weight.sum())])
-        mixture = fit_mixture(np.concatenate(every[-3:]), 12, rng)
+        # draws stay: a ridge's far end must not be forgotten because no point met it
+        kept = every[-3:] if draws is None else [every[0], *every[1:][-2:]]
+        mixture = fit_mixture(np.concatenate(kept), 12, rng)
     proposal = defended(target, mixture, 0.1)
     logs = np.concatenate([_weighed(target, proposal, rng)[1]
                            for _ in range(BATCHES)])  # fmt: skip

@@ -27,6 +27,8 @@ from .recovery.base import recover
 from .recovery.ridge import Ridge
 from .retrieval.base import retrieve
 from .retrieval.gerchberg_saxton import GerchbergSaxton
+from .retrieval.modal import Modal
+from .retrieval.transport_of_intensity import TransportOfIntensity
 
 __all__ = [
     "Bundle",
@@ -39,11 +41,13 @@ __all__ = [
     "Images",
     "Interference",
     "Inverse",
+    "Modal",
     "Recording",
     "RecordingFields",
     "RetrievalStatus",
     "Retrieved",
     "Ridge",
+    "TransportOfIntensity",
     "angular_spectrum",
     "find_fibrelets",
     "load",

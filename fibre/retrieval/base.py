@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
@@ -102,13 +103,13 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     iterations = np.zeros(count, np.int32)
     for start in tqdm(range(0, count, batch), desc="phase retrieval", unit="batch", disable=not progress):
         part = slice(start, min(start + batch, count))
-        amplitudes = np.sqrt(np.maximum(intensities[part], 0)).astype(np.float32)
+        measured = intensities[part].astype(np.float32)
         uncertain = None if variance is None else variance[part].astype(np.float32)
-        weights, best = _weights(amplitudes, uncertain)
+        amplitudes, weights, best = _weights(measured, uncertain)
+        noise = _relative_noise(amplitudes, weights, best)
         stack = Stack(
-            intensities[part].astype(np.float32), uncertain, amplitudes, weights,
-            _relative_noise(amplitudes, weights, best), masks, diversity.distances, diversity.wavelength,
-            diversity.pixel_size,
+            measured, uncertain, *(np.asarray(x) for x in (amplitudes, weights, noise)), masks, diversity.distances,
+            diversity.wavelength, diversity.pixel_size,
         )  # fmt: skip
         found = method.solve(stack)
         field[part], iterations[part] = found.field, found.iterations
@@ -125,41 +126,49 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     )
 
 
-def _weights(amplitudes: np.ndarray, variance: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Relative inverse variances of the amplitudes, (b, m, y, x), and the variance of weight 1, (b)."""
+@jax.jit
+def _weights(intensities: jax.Array, variance: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Amplitudes, their relative inverse variances, both (b, m, y, x), and the variance of weight 1, (b)."""
+    amplitudes = jnp.sqrt(jnp.maximum(intensities, 0))
     if variance is None:
-        return np.ones_like(amplitudes), None
-    usable = np.isfinite(variance)
-    deviation = np.sqrt(np.where(usable, variance, 1))
+        return amplitudes, jnp.ones_like(amplitudes), None
+    usable = jnp.isfinite(variance)
+    deviation = jnp.sqrt(jnp.where(usable, variance, 1))
     # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
-    spread = deviation**2 / (4 * np.maximum(amplitudes**2, deviation))
-    best = np.where(usable, spread, np.inf).min((1, 2, 3))
-    return np.where(usable, best[:, None, None, None] / spread, 0).astype(np.float32), best
+    spread = deviation**2 / (4 * jnp.maximum(amplitudes**2, deviation))
+    best = jnp.where(usable, spread, jnp.inf).min((1, 2, 3))
+    return amplitudes, jnp.where(usable, best[:, None, None, None] / spread, 0), best
 
 
-def _relative_noise(amplitudes: np.ndarray, weights: np.ndarray, best: np.ndarray | None) -> np.ndarray:
+@jax.jit
+def _relative_noise(amplitudes: jax.Array, weights: jax.Array, best: jax.Array | None) -> jax.Array:
     if best is None:
-        return np.zeros(len(amplitudes), np.float32)
+        return jnp.zeros(len(amplitudes), jnp.float32)
     power = (weights * amplitudes**2).sum((1, 2, 3))
-    return np.sqrt(best * (weights > 0).sum((1, 2, 3)) / np.maximum(power, 1e-30)).astype(np.float32)
+    return jnp.sqrt(best * (weights > 0).sum((1, 2, 3)) / jnp.maximum(power, 1e-30))
+
+
+@jax.jit
+def _misfit(field: jax.Array, amplitudes: jax.Array, weights: jax.Array, masks: jax.Array) -> jax.Array:
+    views = jnp.abs(jnp.fft.ifft2(jnp.fft.fft2(field)[:, None] * masks))
+    return (weights * (views - amplitudes) ** 2).sum((1, 2, 3)) / weights.sum((1, 2, 3))
 
 
 def misfit(field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """Weighted mean squared difference between the field's amplitudes and the measured ones, (b)."""
-    views = jnp.abs(jnp.fft.ifft2(jnp.fft.fft2(field)[:, None] * masks))
-    squared = weights * (views - amplitudes) ** 2
-    return np.asarray(squared.sum((1, 2, 3))) / weights.sum((1, 2, 3))
+    return np.asarray(_misfit(field, amplitudes, weights, masks))
 
 
+@jax.jit
 def _noise(
-    field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, best: np.ndarray | None, masks: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    field: jax.Array, amplitudes: jax.Array, weights: jax.Array, best: jax.Array | None, masks: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Variance of the complex field from the image noise, and whether the images are misfitted beyond it."""
     images = amplitudes.shape[1]
-    left = misfit(field, amplitudes, weights, masks)
+    left = _misfit(field, amplitudes, weights, masks)
     if best is None:
         # nothing known of the noise: what the best fit leaves over is all there is to go by
-        return 2 * left / images, np.zeros(len(field), bool)
+        return 2 * left / images, jnp.zeros(len(field), bool)
     # sum of w = sum of best / spread: pixels of equal weight would each have this variance
     expected = best * (weights > 0).sum((1, 2, 3)) / weights.sum((1, 2, 3))
     slack = 0.01 * (weights * amplitudes**2).sum((1, 2, 3)) / weights.sum((1, 2, 3))

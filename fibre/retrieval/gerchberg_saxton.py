@@ -67,7 +67,7 @@ class GerchbergSaxton(RetrievalMethod):
         flat = np.zeros(amplitudes.shape[-2:], amplitudes.dtype)
         field, change, count = _run(amplitudes, weights, masks, flat, tolerance, *settings, coarse)
         spent = np.full(len(field), count + self.averaging)
-        left = misfit(field, amplitudes, weights, masks)
+        left = np.array(misfit(field, amplitudes, weights, masks))
         for restart in range(self.restarts):
             # a stagnated field leaves several times the misfit of its neighbours; noise differs far less
             suspect = (change > tolerance) | (left > 1.5 * np.median(left))

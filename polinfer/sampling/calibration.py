@@ -48,10 +48,15 @@ class Ranks:
         return np.array([chisquare(np.bincount(row, minlength=bins)).pvalue for row in place])
 
     def coverage(self, level: float) -> np.ndarray:
-        """Share of the simulations whose truth lies in the central interval that holds ``level`` of the draws."""
+        """Share of the simulations whose truth lies in the central interval that holds ``level`` of the posterior.
+
+        A rank among n draws tells the place of the truth to 1 / (n + 1): at the interval's ends it counts in part, so that
+        uniform ranks hold ``level`` for any number of draws.
+        """
         level = real_number("level", level, above=0, high=1)
-        place = (self.ranks + 0.5) / (self.draws + 1)
-        return np.mean(np.abs(place - 0.5) < 0.5 * level, axis=1)
+        low, high = self.ranks / (self.draws + 1), (self.ranks + 1) / (self.draws + 1)
+        inside = np.minimum(high, 0.5 * (1 + level)) - np.maximum(low, 0.5 * (1 - level))
+        return np.asarray(np.mean(np.clip(inside * (self.draws + 1), 0, 1), axis=1))
 
 
 def calibration_ranks(

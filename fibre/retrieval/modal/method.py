@@ -1,0 +1,192 @@
+"""The method: geometry once, then for every field a start and Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse.linalg
+import scipy.spatial
+
+from fibre.records import Fibrelets
+from fibre.retrieval.base import RetrievalMethod, Solution, Stack
+from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
+from fibre.retrieval.modal.newton import Coupling, Found, Problem, make_coupling, refine
+from fibre.retrieval.modal.start import Neighbours, make_neighbours, spreads, synchronise
+from fibre.retrieval.modal.views import Views, coarse_images, coarse_variance, make_views
+from polinfer.checks import integer, one_of_types, real_number
+
+__all__ = ["Modal"]
+
+MOST = 20  # Gerchberg-Saxton sweeps where no image is local
+
+
+@dataclass(frozen=True)
+class Modal(RetrievalMethod):
+    r"""The complex amplitudes of the fibrelet modes that explain the images best.
+
+    The field is :math:`E = \sum_k c_k \psi_k` with Gaussian modes :math:`\psi_k` at known places, so thousands of
+    numbers are sought and not a frame, from all photons of all images:
+
+    .. math:: \min_c \sum_i \sum_x w_i \left( g_i |F^{-1} M_i F[E]|^2 - I_i \right)^2
+
+    with weights inverse to the variances, by Gauss-Newton steps whose linear equations are solved by conjugate
+    gradients. Two things make that fast and sure. In images of little defocus only neighbouring modes meet; they are
+    *linear* in the powers and the products :math:`c_k c_l^*` of neighbours, which are found first, and phases put
+    together from them: no random start, no stagnation. And the steps are preconditioned by the Laplacian of the
+    neighbours' phases, in which errors are large that reach far. Where no image is that local (masks that spread
+    light, large defocus), a few sweeps of :class:`fibre.GerchbergSaxton` make the start.
+
+    All is computed on a grid of half a mode radius, with images filtered to its band limit. Light that no mode carries
+    is a misfit.
+
+    Parameters
+    ----------
+    fibrelets: places and radii of the modes. steps: most Gauss-Newton steps, >= 1. inner: most conjugate gradients in
+    each, >= 1. tolerance: relative change of the amplitudes at which the steps end, >= 0. focus_spread: metres,
+    standard deviation of a common error of all distances, found with the field; 0: none, and needed where masks are
+    not those of a defocus. gain_spread: the same for the brightness of each image, relative to 1. coarsening: camera
+    pixels in a pixel of the grid, None: as the modes allow.
+
+    Raises
+    ------
+    ValueError: settings out of range; focus_spread for images that were not made by defocus. TypeError: fibrelets of
+    another kind.
+
+    Source: the products of neighbours are PhaseLift (Candes, Strohmer and Voroninski, 2013), made local; Gauss-Newton
+    for phase retrieval, Fienup (1982) and later.
+
+    >>> from fibre import Bundle, Defocus, Fibrelets, Modal, retrieve
+    >>> bundle = Bundle.hexagonal(radius=15e-6, rng=0)
+    >>> c = np.exp(2j * np.pi * np.random.default_rng(1).random((2, bundle.cores)))
+    >>> z = np.array([-1, 0, 1]) * 8e-6
+    >>> images = np.abs(bundle.image(c, (64, 64), 0.78e-6, z)[:, 0]) ** 2
+    >>> method = Modal(Fibrelets(bundle.centres, bundle.mode_radius))
+    >>> field = retrieve(Defocus(images, z, bundle.wavelength, 0.78e-6), method).field
+    >>> true = bundle.image(c, (64, 64), 0.78e-6)[0]
+    >>> bool(abs(np.vdot(field, true)) > 0.999 * np.linalg.norm(field) * np.linalg.norm(true))
+    True
+    """
+
+    fibrelets: Fibrelets
+    steps: int = 12
+    inner: int = 8
+    tolerance: float = 2e-3
+    focus_spread: float = 0.0
+    gain_spread: float = 0.0
+    coarsening: int | None = None
+
+    def __post_init__(self) -> None:
+        one_of_types("fibrelets", self.fibrelets, (Fibrelets,), "pass Fibrelets(centres, mode_radius).")
+        integer("steps", self.steps, low=1)
+        integer("inner", self.inner, low=1)
+        real_number("tolerance", self.tolerance, low=0)
+        real_number("focus_spread", self.focus_spread, low=0)
+        real_number("gain_spread", self.gain_spread, low=0)
+        if self.coarsening is not None:
+            integer("coarsening", self.coarsening, low=1)
+
+    def solve(self, stack: Stack) -> Solution:
+        """See :meth:`RetrievalMethod.solve`."""
+        found = [self.amplitudes(stack, k) for k in range(len(stack.intensities))]
+        camera = _geometry(self, stack).camera
+        field = np.stack([camera.focus(one.amplitudes) for one in found])
+        converged = np.array([one.step <= max(self.tolerance, 2e-2) for one in found])
+        return Solution(field, converged, np.array([one.steps for one in found]))
+
+    def amplitudes(self, stack: Stack, k: int) -> Found:
+        """Amplitudes of field ``k`` of a stack, and what was found of the bench. Field in focus = sum of c times
+        modes of unit sum of squares over the camera's pixels."""
+        geometry = _geometry(self, stack)
+        ones = np.ones(len(stack.masks))
+        if not np.any(stack.intensities[k] > 0):
+            return Found(np.zeros(len(self.fibrelets.centres), complex), 0.0, ones, 0.0, 0.0)
+        step = geometry.views.step
+        intensities = stack.intensities[k]
+        variance = _variance(intensities) if stack.variance is None else stack.variance[k]
+        known = np.isfinite(variance)
+        images = coarse_images(np.where(known, intensities, np.maximum(intensities, 0)), step)
+        spread = coarse_variance(variance, step)
+        weights = np.where(np.isfinite(spread), 1 / spread, 0).astype(np.float32)
+        turn = None
+        if self.focus_spread > 0:
+            if stack.distances is None:
+                raise ValueError("focus_spread is positive, but the images were not made by defocus; build them with "
+                                 "Defocus(...) or set focus_spread to 0.")  # fmt: skip
+            turn = geometry.turn
+        problem = Problem(images, weights, turn, self.focus_spread, self.gain_spread)
+        if geometry.neighbours is None:
+            start = self._swept(stack, k, geometry)
+        else:
+            powers, products = geometry.neighbours.products(images)
+            start = synchronise(geometry.neighbours.pairs, powers, products)
+        return refine(geometry.views, geometry.coupling, problem, Found(start, 0.0, ones), self.steps, self.inner,
+                      self.tolerance)  # fmt: skip
+
+    def _swept(self, stack: Stack, k: int, geometry: Geometry) -> np.ndarray:
+        """Amplitudes from a few sweeps of all planes."""
+        one = Stack(*(None if x is None else x[k : k + 1] for x in (stack.intensities, stack.variance)),
+                    stack.amplitudes[k : k + 1], stack.weights[k : k + 1], stack.noise[k : k + 1], stack.masks,
+                    stack.distances, stack.wavelength, stack.pixel_size)  # fmt: skip
+        field = GerchbergSaxton(iterations=MOST, averaging=0, restarts=1).solve(one).field[0]
+        camera = geometry.camera
+        parts = camera.transposed @ field.reshape(-1, 1).view(np.float32)
+        parts = geometry.gram.solve(parts.astype(float))
+        return parts[:, 0] + 1j * parts[:, 1]
+
+
+class Geometry(NamedTuple):
+    """What depends on fibrelets, frame and masks only. ``camera``: the camera's own grid."""
+
+    views: Views
+    camera: Views
+    coupling: Coupling
+    neighbours: Neighbours | None
+    gram: scipy.sparse.linalg.SuperLU
+    turn: np.ndarray
+
+
+class _Key:
+    """Fibrelets and masks by their values: the geometry takes seconds, and a run asks for the same one every time."""
+
+    def __init__(self, method: Modal, stack: Stack) -> None:
+        self.method, self.stack = method, stack
+        known = stack.masks if stack.distances is None else stack.distances
+        fibrelets = method.fibrelets
+        self.values = (fibrelets.centres.tobytes(), fibrelets.mode_radius.tobytes(), known.tobytes(),
+                       stack.masks.shape, stack.pixel_size, stack.wavelength, method.coarsening)  # fmt: skip
+
+    def __hash__(self) -> int:
+        return hash(self.values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.values == other.values
+
+
+def _geometry(method: Modal, stack: Stack) -> Geometry:
+    return _made(_Key(method, stack))
+
+
+@lru_cache(maxsize=2)
+def _made(key: _Key) -> Geometry:
+    method, masks, pixel = key.method, key.stack.masks, key.stack.pixel_size
+    key.method = key.stack = None  # type: ignore[assignment]  # the cache must not hold images
+    fibrelets, wavelength = method.fibrelets, key.values[5]
+    views = make_views(fibrelets, masks, pixel, method.coarsening)
+    camera = make_views(fibrelets, masks, pixel, 1)
+    fields, radii = spreads(fibrelets, masks, pixel)
+    tree = scipy.spatial.cKDTree(fibrelets.centres)
+    gram = scipy.sparse.linalg.splu((camera.transposed @ camera.modes).tocsc().astype(float))
+    fy, fx = (np.fft.fftfreq(n, views.pixel_size) for n in views.masks.shape[-2:])
+    squared = np.maximum(1 / wavelength**2 - fy[:, None] ** 2 - fx**2, 0)
+    turn = (2 * np.pi * (np.sqrt(squared) - 1 / wavelength)).astype(np.float32)
+    return Geometry(views, camera, make_coupling(tree, views, radii),
+                    make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn)  # fmt: skip
+
+
+def _variance(images: np.ndarray) -> np.ndarray:
+    """Where nothing is known of the noise: in proportion to the light, with a floor of 1 % of its mean."""
+    mean = images.mean(axis=(1, 2), keepdims=True)
+    return np.maximum(images, 0) + 0.01 * mean
