@@ -23,9 +23,8 @@ from polinfer import Fit, Measurement, Model, Parameters, Status
 from polinfer.fitting.fast import climb, describe, kernel
 from polinfer.fitting.fast import scene as fast
 from polinfer.fitting.fast.data import Data, prepare
-from polinfer.fitting.fast.edges import correct_edges
-from polinfer.fitting.fast.engine import Responses, solve_frame
-from polinfer.fitting.fast.frame import status_of
+from polinfer.fitting.fast.engine import Responses
+from polinfer.fitting.fast.frame import solve, status_of
 from polinfer.fitting.fast.point import Point, dot, polariser_vectors, retarder_vectors, unit
 from polinfer.fitting.fast.priors import log_prior
 from polinfer.fitting.residuals import BAD_FIT_PROBABILITY
@@ -214,10 +213,8 @@ def _scene(model: Model, leave: Leave) -> Any:
 def fit(model: Model, measurement: Measurement, leave: Leave) -> Fit:
     """What :func:`polinfer.fit` gives for pixels that can all be fitted."""
     known, frame = _scene(model, leave), _frame(measurement, leave)
-    rows, flags = solve_frame(known, frame, None, lambda _: None)
-    correct_edges(known, rows, flags)
-    edge = (flags & (describe.FROZEN[0] | describe.FROZEN[2])) != 0
-    status = status_of(model, rows, edge)
+    solved = solve(known, frame)
+    rows, status = solved.rows, status_of(model, solved)
     degrees = 4 * measurement.states - len(model.free)
     worst = 2 * gammainccinv(0.5 * degrees, BAD_FIT_PROBABILITY)
     status |= np.where(rows[describe.ROWS["chi_square"]] > worst, np.int32(Status.BAD_FIT), np.int32(0))

@@ -25,12 +25,14 @@ from .records import (
 )
 from .recovery.base import recover
 from .recovery.ridge import Ridge
+from .retrieval.accelerated import Accelerated
 from .retrieval.base import retrieve
 from .retrieval.gerchberg_saxton import GerchbergSaxton
 from .retrieval.modal import Modal
 from .retrieval.transport_of_intensity import TransportOfIntensity
 
 __all__ = [
+    "Accelerated",
     "Bundle",
     "Calibration",
     "CalibrationFields",

@@ -25,21 +25,49 @@ def _load(path: Path, kinds: tuple[type, ...]) -> Any:
 @click.command("retrieve")
 @click.argument("record", type=_PATH)
 @click.argument("out", type=_PATH)
-@click.option("--iterations", type=int, default=150, show_default=True, help="Most Gerchberg-Saxton sweeps.")
+@click.option(
+    "--method",
+    type=click.Choice(["gerchberg-saxton", "accelerated", "modal"]),
+    default="gerchberg-saxton",
+    show_default=True,
+    help="modal: amplitudes of the fibrelets; accelerated: any field.",
+)
+@click.option("--iterations", type=int, default=150, show_default=True, help="Most sweeps; modal does not need them.")
 @click.option("--fibrelets", type=_PATH, help="Calibration fields whose fibrelets to use; needed for a recording.")
 @click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
-def retrieve_command(record: Path, out: Path, iterations: int, fibrelets: Path | None, overwrite: bool) -> None:
+def retrieve_command(
+    record: Path, out: Path, method: str, iterations: int, fibrelets: Path | None, overwrite: bool
+) -> None:
     """Fields of every capture of RECORD (a Calibration or a Recording), written to OUT.
 
-    Example: polinfer retrieve sample.nc sample-fields.nc --fibrelets calibration-fields.nc
+    Example: polinfer retrieve sample.nc sample-fields.nc --fibrelets calibration-fields.nc --method modal
     """
     import numpy as np
 
-    from fibre import Calibration, CalibrationFields, GerchbergSaxton, Recording, RecordingFields, retrieve_fields, save
+    from fibre import (
+        Accelerated,
+        Calibration,
+        CalibrationFields,
+        GerchbergSaxton,
+        Modal,
+        Recording,
+        RecordingFields,
+        retrieve_fields,
+        save,
+    )
+    from fibre.fields import fibrelets_of
 
     data = _load(record, (Calibration, Recording))
     known = None if fibrelets is None else _load(fibrelets, (CalibrationFields,)).fibrelets
-    fields = retrieve_fields(data, GerchbergSaxton(iterations=iterations), fibrelets=known, progress=True)
+    if known is None and isinstance(data, Calibration):
+        known = fibrelets_of(data)
+    if method == "modal":
+        if known is None:
+            raise click.UsageError("fibrelets must be given for a Recording; pass --fibrelets calibration-fields.nc.")
+        chosen: Any = Modal(known)
+    else:
+        chosen = {"gerchberg-saxton": GerchbergSaxton, "accelerated": Accelerated}[method](iterations=iterations)
+    fields = retrieve_fields(data, chosen, fibrelets=known, progress=True)
     click.echo(f"wrote {save(fields, out, overwrite=overwrite)}")
     parts = [fields.status] + ([fields.blank_status] if isinstance(fields, RecordingFields) else [])
     status = np.concatenate(parts)

@@ -28,7 +28,7 @@ from fibre.records import (
 from fibre.retrieval.base import RetrievalMethod, retrieve
 from polinfer.checks import one_of_types
 
-__all__ = ["retrieve_fields"]
+__all__ = ["fibrelets_of", "retrieve_fields"]
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def retrieve_fields(
     one_of_types("record", record, (Calibration, Recording), "pass a Calibration or a Recording.")
     if isinstance(record, Calibration):
         if fibrelets is None:
-            fibrelets = _find(record.images)
+            fibrelets = fibrelets_of(record)
         reference = _retrieve(record.references, method, fibrelets, progress, "reference")
         mean_reference = _mean_reference(reference)
         fields = _retrieve(record.images, method, fibrelets, progress, "calibration").in_phase_with(mean_reference)
@@ -164,8 +164,9 @@ def retrieve_fields(
     )
 
 
-def _find(images: Images) -> Fibrelets:
+def fibrelets_of(calibration: Calibration) -> Fibrelets:
     """Fibrelets in the sum of all interference images: every capture lights others, and incoherent sums are even."""
+    images = calibration.images
     total = np.zeros(images.frame)
     for capture in range(images.captures):
         frames = np.asarray(images.radiance[capture])[len(images.diversity) :].mean(0)

@@ -108,8 +108,8 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
         amplitudes, weights, best = _weights(measured, uncertain)
         noise = _relative_noise(amplitudes, weights, best)
         stack = Stack(
-            measured, uncertain, *(np.asarray(x) for x in (amplitudes, weights, noise)), masks, diversity.distances,
-            diversity.wavelength, diversity.pixel_size,
+            measured, uncertain, np.asarray(amplitudes), np.asarray(weights), np.asarray(noise), masks,
+            diversity.distances, diversity.wavelength, diversity.pixel_size,
         )  # fmt: skip
         found = method.solve(stack)
         field[part], iterations[part] = found.field, found.iterations

@@ -50,8 +50,8 @@ class Ranks:
     def coverage(self, level: float) -> np.ndarray:
         """Share of the simulations whose truth lies in the central interval that holds ``level`` of the posterior.
 
-        A rank among n draws tells the place of the truth to 1 / (n + 1): at the interval's ends it counts in part, so that
-        uniform ranks hold ``level`` for any number of draws.
+        A rank among n draws tells the place of the truth to 1 / (n + 1): at the interval's ends it counts in part, so
+        that uniform ranks hold ``level`` for any number of draws.
         """
         level = real_number("level", level, above=0, high=1)
         low, high = self.ranks / (self.draws + 1), (self.ranks + 1) / (self.draws + 1)

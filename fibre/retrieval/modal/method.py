@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -127,9 +127,11 @@ class Modal(RetrievalMethod):
 
     def _swept(self, stack: Stack, k: int, geometry: Geometry) -> np.ndarray:
         """Amplitudes from a few sweeps of all planes."""
-        one = Stack(*(None if x is None else x[k : k + 1] for x in (stack.intensities, stack.variance)),
-                    stack.amplitudes[k : k + 1], stack.weights[k : k + 1], stack.noise[k : k + 1], stack.masks,
-                    stack.distances, stack.wavelength, stack.pixel_size)  # fmt: skip
+        own = slice(k, k + 1)
+        one = replace(
+            stack, intensities=stack.intensities[own], amplitudes=stack.amplitudes[own], weights=stack.weights[own],
+            noise=stack.noise[own], variance=None if stack.variance is None else stack.variance[own],
+        )  # fmt: skip
         field = GerchbergSaxton(iterations=MOST, averaging=0, restarts=1).solve(one).field[0]
         camera = geometry.camera
         parts = camera.transposed @ field.reshape(-1, 1).view(np.float32)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.ndimage
 import scipy.sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from fibre.retrieval.modal.views import Views
 
@@ -92,7 +92,9 @@ class _Preconditioner:
         smooth = [scipy.ndimage.gaussian_filter(w, r / 2, mode="nearest") for w, r in
                   zip(_harmonic(weights), coupling.radii, strict=True)]  # fmt: skip
         smooth = [1 / np.maximum(s.ravel(), 1e-30) for s in smooth]
-        self.pairs, self.phase = coupling.pairs, None
+        self.pairs = coupling.pairs
+        self.phase: SuperLU | None = None
+        self.damping = 0.0
         self.strength = sum(s[coupling.middles] * g for s, g in zip(smooth, coupling.strength, strict=True))
         self.own = sum(s[coupling.places] * g for s, g in zip(smooth, coupling.own, strict=True))
 
@@ -114,6 +116,7 @@ class _Preconditioner:
         self.amplitude = diagonal + self.damping
 
     def __call__(self, gradient: np.ndarray) -> np.ndarray:
+        assert self.phase is not None
         straight = gradient * self.turn.conj()
         return (straight.real / self.amplitude + 1j * self.phase.solve(straight.imag)) * self.turn
 
@@ -141,7 +144,7 @@ class _State:
         self.residual = self.gains * power - problem.images
         self.power = power
         usable = np.count_nonzero(problem.weights)
-        self.cost = float(np.sum(problem.weights * self.residual**2, dtype=float)) / max(usable, 1)
+        self.cost = float(np.sum(problem.weights * self.residual**2, dtype=float)) / max(int(usable), 1)
 
     def nuisance(self) -> np.ndarray | None:
         """Derivatives of the images to focus and gains, in units of their spreads: (k, image, y, x), or None."""
@@ -188,7 +191,7 @@ def refine(
                 break
         else:
             return replace(found, step=0.0, steps=count)
-        size = shrink * float(np.linalg.norm(change) / max(np.linalg.norm(moved.amplitudes), 1e-300))
+        size = shrink * float(np.linalg.norm(change)) / max(float(np.linalg.norm(moved.amplitudes)), 1e-300)
         gained = 1 - trial.cost / state.cost
         state, found = trial, replace(moved, cost=trial.cost, step=size, steps=count)
         if size < tolerance or gained < 1e-3:

@@ -7,6 +7,7 @@ the same coarse grid. Called by the start and by the Gauss-Newton steps of :clas
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -47,9 +48,9 @@ class Views:
 
     def adjoint(self, fields: np.ndarray) -> np.ndarray:
         """The adjoint of both together: complex128 (m,)."""
-        # conj of the sum of conj(F) M: a conjugate of one image instead of all masks
-        spectra = scipy.fft.fft2(fields, workers=-1, overwrite_x=True)
-        spectrum = np.vecdot(spectra, self.masks, axis=0).conj()
+        # conj of the sum of conj(F) M: vecdot conjugates as it goes, no second copy of all images
+        spectra: Any = scipy.fft.fft2(fields, workers=-1, overwrite_x=True)
+        spectrum = np.vecdot(np.moveaxis(spectra, 0, -1), np.moveaxis(self.masks, 0, -1)).conj()
         back = scipy.fft.ifft2(spectrum, workers=-1, overwrite_x=True).reshape(-1, 1)
         parts = self.transposed @ back.view(np.float32)
         return parts[:, 0].astype(float) + 1j * parts[:, 1]
