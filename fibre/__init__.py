@@ -3,6 +3,7 @@
 from polinfer.storage import save
 
 from .bundle import Bundle
+from .drift import Drift, track_drift
 from .fibrelets import find_fibrelets
 from .fields import retrieve_fields
 from .files import load
@@ -38,6 +39,7 @@ __all__ = [
     "CalibrationFields",
     "Defocus",
     "Diversity",
+    "Drift",
     "Fibrelets",
     "GerchbergSaxton",
     "Images",
@@ -59,4 +61,5 @@ __all__ = [
     "retrieve",
     "retrieve_fields",
     "save",
+    "track_drift",
 ]

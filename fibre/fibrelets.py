@@ -26,8 +26,9 @@ def find_fibrelets(image: Any) -> np.ndarray:
 
     The lattice pitch p comes from the strongest ring of the image's power spectrum (first order of a hexagonal
     lattice, :math:`2/(\sqrt 3 p)`); maxima of the slightly smoothed image at least 0.6 p apart are taken, and each is
-    refined by a quadratic fit to the logarithm of its 3 x 3 neighbourhood. Maxima below a tenth of the typical one,
-    and those at the frame's edge, are left out.
+    refined by a quadratic fit to the logarithm of its 3 x 3 neighbourhood. Left out are maxima below a tenth of the
+    typical one, those within six standard deviations of the noise that is seen where no fibrelet is near, and those at
+    the frame's edge.
 
     ``image``: real (y, x), non-negative up to noise, pitch at least 4 pixels. Raises ValueError when no lattice is
     found.
@@ -120,11 +121,12 @@ def _pitch(image: np.ndarray) -> float:
 
 def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
     """Sub-pixel centres (m, 2), row by row."""
-    from skimage.feature import peak_local_max
-
     pitch = _pitch(image)
     smooth = scipy.ndimage.gaussian_filter(image, 0.08 * pitch)
-    peaks = peak_local_max(smooth, min_distance=max(1, int(0.4 * pitch)), exclude_border=2)
+    highest = smooth == scipy.ndimage.maximum_filter(smooth, 2 * max(1, int(0.3 * pitch)) + 1)
+    # two pixels are kept for the neighbourhood in which a maximum is refined
+    highest[:2] = highest[-2:] = highest[:, :2] = highest[:, -2:] = False
+    peaks = np.argwhere(highest)
     if len(peaks) == 0:
         raise ValueError("image shows no fibrelets; light the whole facet evenly and focus on it.")
     heights = smooth[tuple(peaks.T)]
@@ -133,13 +135,20 @@ def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
     # typical is the maximum to which the brighter ones hold half of the light: noise in a wide dark margin has many
     # maxima, but little light
     light = np.cumsum(np.maximum(heights, 0))
-    bright = heights > faintest * heights[np.searchsorted(light, 0.5 * light[-1])]
-    dark = smooth[smooth <= np.median(smooth)]
-    bright &= heights > np.median(dark) + 10 * 1.4826 * np.median(np.abs(dark - np.median(dark)))
-    peaks = peaks[bright]
-    tree = scipy.spatial.cKDTree(peaks)
-    weaker = {j for i, j in (sorted(pair) for pair in tree.query_pairs(0.6 * pitch))}
-    peaks = np.delete(peaks, sorted(weaker), axis=0)
+    typical = heights[np.searchsorted(light, 0.5 * light[-1])]
+    lit = heights > faintest * typical
+    bright = heights > max(faintest, 0.3) * typical
+    for _ in range(3):
+        # noise is seen where no fibrelet is near; each time round fainter ones are known and kept out of it
+        near = np.zeros(image.shape)
+        near[tuple(peaks[bright].T)] = 1
+        dark = smooth[scipy.ndimage.maximum_filter(near, 2 * int(np.ceil(1.2 * pitch)) + 1) == 0]
+        if len(dark) < 100:  # the facet fills the frame
+            bright = lit
+            break
+        level = np.median(dark)
+        bright = lit & (heights > level + 6 * 1.4826 * np.median(np.abs(dark - level)))
+    peaks = _apart(peaks[bright], 0.6 * pitch)
     offsets = np.indices((3, 3)).reshape(2, -1).T - 1
     around = smooth[peaks[:, None, 0] + offsets[:, 0], peaks[:, None, 1] + offsets[:, 1]]
     logs = np.log(np.maximum(around, 1e-3 * around.max(1, keepdims=True)))
@@ -156,6 +165,15 @@ def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
     centres = peaks + np.clip(step, -1, 1)
     # by the rows of pixels: rounding in the last digit of a centre must not decide about the order
     return centres[np.lexsort((peaks[:, 1], peaks[:, 0]))]
+
+
+def _apart(peaks: np.ndarray, distance: float) -> np.ndarray:
+    """Peaks, brightest first, without those that are nearer than ``distance`` to a brighter one that is kept."""
+    pairs = scipy.spatial.cKDTree(peaks).query_pairs(distance, output_type="ndarray")
+    kept = np.ones(len(peaks), bool)
+    for bright, faint in sorted(map(tuple, np.sort(pairs, axis=1).tolist())):
+        kept[faint] &= not kept[bright]
+    return peaks[kept]
 
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:

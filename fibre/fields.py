@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from fibre.closure import closure_errors, closure_phases, noise_scale
+from fibre.drift import Drift
 from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
@@ -79,17 +80,26 @@ def _reference_region(reference: np.ndarray) -> np.ndarray:
 
 @overload
 def retrieve_fields(
-    record: Calibration, method: RetrievalMethod, fibrelets: Fibrelets | None = None, progress: bool = False
+    record: Calibration,
+    method: RetrievalMethod,
+    fibrelets: Fibrelets | None = None,
+    progress: bool = False,
+    drift: Drift | None = None,
 ) -> CalibrationFields: ...
 @overload
 def retrieve_fields(
-    record: Recording, method: RetrievalMethod, fibrelets: Fibrelets | None = None, progress: bool = False
+    record: Recording,
+    method: RetrievalMethod,
+    fibrelets: Fibrelets | None = None,
+    progress: bool = False,
+    drift: Drift | None = None,
 ) -> RecordingFields: ...
 def retrieve_fields(
     record: Calibration | Recording,
     method: RetrievalMethod,
     fibrelets: Fibrelets | None = None,
     progress: bool = False,
+    drift: Drift | None = None,
 ) -> CalibrationFields | RecordingFields:
     r"""Fields of every capture, in fibrelet modes, with variance.
 
@@ -109,19 +119,25 @@ def retrieve_fields(
     ----------
     record: a Calibration or a Recording. method: for instance ``GerchbergSaxton()``. fibrelets: where the fibrelets
     are; a calibration finds them in its own images (None), a recording must be given its calibration's. progress:
-    show a bar.
+    show a bar. drift: piston and tilt against time (:func:`fibre.track_drift`), taken out of every capture and
+    reference at its time, and counted in the variance; the reference spot sets the piston in any case, so that it is
+    the tilt that this is for. None: the fibre holds still but for pistons.
 
     Raises
     ------
     TypeError, ValueError: a record of another kind; a recording without ``fibrelets``.
     """
     one_of_types("record", record, (Calibration, Recording), "pass a Calibration or a Recording.")
+    if drift is not None:
+        one_of_types("drift", drift, (Drift,), "make one with track_drift.")
     if isinstance(record, Calibration):
         if fibrelets is None:
             fibrelets = fibrelets_of(record)
-        reference = _retrieve(record.references, method, fibrelets, progress, "reference")
+        reference = _retrieve(record.references, method, fibrelets, progress, "reference", drift)
         mean_reference = _mean_reference(reference)
-        fields = _retrieve(record.images, method, fibrelets, progress, "calibration").in_phase_with(mean_reference)
+        fields = _retrieve(record.images, method, fibrelets, progress, "calibration", drift).in_phase_with(
+            mean_reference
+        )
         groups = _groups(record)
         for chosen, states in groups:
             fields.values[chosen] = fields.of(chosen).closed(mean_reference, states).values
@@ -142,10 +158,10 @@ def retrieve_fields(
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
-    reference = _retrieve(record.references, method, fibrelets, progress, "reference")
+    reference = _retrieve(record.references, method, fibrelets, progress, "reference", drift)
     mean_reference = _mean_reference(reference)
-    fields = _retrieve(record.images, method, fibrelets, progress, "sample").in_phase_with(mean_reference)
-    blank = _retrieve(record.blank, method, fibrelets, progress, "blank").in_phase_with(mean_reference)
+    fields = _retrieve(record.images, method, fibrelets, progress, "sample", drift).in_phase_with(mean_reference)
+    blank = _retrieve(record.blank, method, fibrelets, progress, "blank", drift).in_phase_with(mean_reference)
     fields, blank = (part.closed(mean_reference, record.illumination) for part in (fields, blank))
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
     noise = noise_scale(np.concatenate(errors, axis=1))
@@ -175,7 +191,13 @@ def fibrelets_of(calibration: Calibration) -> Fibrelets:
 
 
 def _retrieve(
-    images: Images, method: RetrievalMethod, fibrelets: Fibrelets, progress: bool, name: str, batch: int = 8
+    images: Images,
+    method: RetrievalMethod,
+    fibrelets: Fibrelets,
+    progress: bool,
+    name: str,
+    drift: Drift | None = None,
+    batch: int = 8,
 ) -> _Amplitudes:
     planes = len(images.diversity)
     modes = mode_matrix(fibrelets, images.frame, images.pixel_size)
@@ -210,6 +232,9 @@ def _retrieve(
             variance[capture, 1] += ratio * variance[capture, 0]
             bar.update()
     bar.close()
+    if drift is not None:
+        values = drift.correct(values, images.times, fibrelets)
+        variance += np.abs(values) ** 2 * drift.phase_variance(images.times, fibrelets)[:, None]
     return _Amplitudes(values, variance, status)
 
 

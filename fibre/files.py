@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fibre.bundle import Bundle
+from fibre.drift import Drift
 from fibre.records import (
     Calibration,
     CalibrationFields,
@@ -28,6 +29,7 @@ TYPES: tuple[type, ...] = (
     Calibration,
     CalibrationFields,
     Diversity,
+    Drift,
     Fibrelets,
     Images,
     Interference,

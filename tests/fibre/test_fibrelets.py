@@ -1,11 +1,16 @@
 """Fibrelets are found where they are, and fields are expressed in their modes with a true variance."""
 
+import os
+
 import numpy as np
 import pytest
+import scipy.ndimage
 import scipy.spatial
+import skimage.io
 
 from fibre import Bundle, Fibrelets, find_fibrelets
 from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
+from polinfer import datasets
 
 PIXEL, SHAPE = 0.5e-6, (140, 150)
 
@@ -49,6 +54,111 @@ def test_a_wide_dark_margin_adds_no_fibrelets(width):
     distance, _ = scipy.spatial.cKDTree(bundle.centres / pixel + (width - 1) / 2).query(found)
     assert len(found) == bundle.cores
     assert distance.max() < 1
+
+
+def facet(pitch, size, generator, shade=0.0, photons=300, jitter=0.08):
+    """Centres (m, 2) of a turned, jittered hexagonal lattice in a disc, and its noisy image (size, size).
+
+    Fibrelets of unlike brightness and width, on a pedestal of light in the cladding, which fades across the facet by
+    ``shade`` as they do. ``photons`` at a typical peak.
+    """
+    reach = int(size / pitch) + 4
+    row, column = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    lattice = np.stack([row * np.sqrt(3) / 2, column + 0.5 * (row % 2)], -1).reshape(-1, 2) * pitch
+    angle = generator.uniform(0, np.pi / 3)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centres = lattice @ turn + generator.uniform(-0.5, 0.5, 2)
+    centres += jitter * pitch * generator.uniform(-1, 1, centres.shape)
+    radius = 0.42 * size
+    centres = centres[np.hypot(*centres.T) < radius]
+
+    def fading(rows):
+        return 1 - shade * (rows / radius + 1) / 2
+
+    height = generator.uniform(0.4, 1.3, len(centres)) * fading(centres[:, 0])
+    width = 0.3 * pitch * generator.uniform(0.9, 1.1, len(centres))
+    middle = (size - 1) / 2
+    y, x = np.mgrid[:size, :size]
+    image = 0.1 * (np.hypot(y - middle, x - middle) < radius) * fading(y - middle)
+    offset = np.arange(-int(2 * pitch), int(2 * pitch) + 1)
+    centres = centres + middle
+    for centre, h, w in zip(centres, height, width, strict=True):
+        at = np.rint(centre).astype(int)[:, None] + offset
+        down, across = np.exp(-(((at - centre[:, None]) / w) ** 2))
+        image[np.ix_(*at)] += h * np.outer(down, across)
+    return centres, generator.poisson(photons * image + 5) + 2 * generator.normal(size=image.shape)
+
+
+@pytest.mark.parametrize("shade", [0.0, 0.8])
+@pytest.mark.parametrize("pitch", [4.5, 9])
+def test_precision_and_recall_within_half_a_pitch_are_at_least_99_percent(pitch, shade):
+    centres, image = facet(pitch, 300 if pitch < 6 else 500, np.random.default_rng(int(10 * pitch)), shade)
+    found = find_fibrelets(image)
+    distance, nearest = scipy.spatial.cKDTree(centres).query(found)
+    right = len(np.unique(nearest[distance < pitch / 2]))  # one that is found twice counts once
+    assert right / len(found) >= 0.99
+    assert right / len(centres) >= 0.99
+
+
+def test_noise_alone_around_a_small_facet_is_not_a_fibrelet():
+    centres, image = facet(6, 200, np.random.default_rng(7), photons=60)
+    generator = np.random.default_rng(8)
+    wide = generator.poisson(np.full((700, 700), 5)) + 2 * generator.normal(size=(700, 700))
+    wide[250:450, 250:450] = image
+    found = find_fibrelets(wide)
+    distance, _ = scipy.spatial.cKDTree(centres + 250).query(found)
+    assert np.mean(distance < 3) > 0.995
+
+
+def test_a_facet_that_fills_the_frame_has_no_dark_margin_to_know_the_noise_from():
+    centres, image = facet(6, 400, np.random.default_rng(9))
+    found = find_fibrelets(image[120:280, 120:280])
+    inside = centres[np.all((centres > 124) & (centres < 275), axis=1)] - 120
+    distance, _ = scipy.spatial.cKDTree(found).query(inside)
+    assert np.mean(distance < 3) >= 0.99
+    distance, _ = scipy.spatial.cKDTree(centres - 120).query(found)
+    assert np.mean(distance < 3) >= 0.99
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """A measured facet, evenly lit; skipped where the data are not."""
+    try:
+        path = datasets.data_directory() / "fibre_bundle_images" / "usaf1_background.tif"
+        if not path.is_file():
+            raise FileNotFoundError(f"directory has no {path.name}; expected it at {path}.")
+    except FileNotFoundError as error:
+        if os.environ.get("POLINFER_REQUIRE_DATA") == "1":
+            pytest.fail(f"POLINFER_REQUIRE_DATA=1, but {error}")
+        pytest.skip(f"measured data are not here: {error}")
+    return skimage.io.imread(path).astype(float)
+
+
+def test_the_fibrelets_of_a_measured_facet_are_counted_and_evenly_spaced(measured):
+    found = find_fibrelets(measured)
+    assert len(found) == pytest.approx(27838, rel=0.01)  # what PyFibreBundle finds
+    tree = scipy.spatial.cKDTree(found)
+    nearest = tree.query(found, 2)[0][:, 1]
+    assert np.median(nearest) == pytest.approx(4.9, abs=0.1)
+    assert np.mean(np.abs(nearest / np.median(nearest) - 1) < 0.15) > 0.99
+    # no holes and no doubles: triangles between neighbours have one size, up to dirt on the facet
+    corners = found[scipy.spatial.Delaunay(found).simplices]
+    a, b, c = (np.linalg.norm(corners[:, i] - corners[:, i - 1], axis=1) for i in range(3))
+    s = (a + b + c) / 2
+    circumradius = a * b * c / (4 * np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 1e-9)))
+    middle = found.mean(0)
+    within = np.linalg.norm(corners.mean(1) - middle, axis=1) < np.linalg.norm(found - middle, axis=1).max() - 8
+    assert np.sum(circumradius[within] > 1.5 * np.median(circumradius)) < 10
+
+
+def test_centres_in_a_measured_facet_are_where_the_light_is(measured):
+    """Brighter than the ring of pixels half a pitch around, without any of the function's own smoothing."""
+    found = find_fibrelets(measured)
+    y, x = np.mgrid[-3:4, -3:4]
+    ring = (np.hypot(y, x) > 2) & (np.hypot(y, x) < 3)
+    around = scipy.ndimage.convolve(measured, ring / ring.sum())
+    places = tuple(np.rint(found).astype(int).T)
+    assert np.mean(measured[places] > 1.2 * around[places]) > 0.995
 
 
 def test_centres_of_separate_spots_are_sub_pixel_for_any_offset():

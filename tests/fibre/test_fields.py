@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fibre import Ridge, reconstruct, recover, retrieve_fields
+from fibre import Drift, Ridge, reconstruct, recover, retrieve_fields
 from fibre.retrieval.base import RetrievalMethod
 from tests.fibre.benches import METHOD, PLAN
 from tests.oracles import jones as oracle
@@ -89,6 +89,30 @@ def test_the_phase_of_whole_captures_does_not_matter(bench):
         # the piston of the reference is what it is: one phase for the whole recording, blank and sample
         phase = np.angle(np.vdot(bench.recording_fields.blank, turned.blank))
         assert np.linalg.norm(found * np.exp(-1j * phase) - usual) < 1e-3 * np.linalg.norm(usual)
+
+
+@dataclass(frozen=True)
+class Tilted(RetrievalMethod):
+    """Another method behind a bench whose phase is tilted by ``slope`` radians a metre along the rows."""
+
+    inner: RetrievalMethod
+    slope: float
+
+    def solve(self, stack):
+        found = self.inner.solve(stack)
+        row = (np.arange(found.field.shape[1]) - (found.field.shape[1] - 1) / 2) * stack.pixel_size
+        return replace(found, field=(found.field * np.exp(1j * self.slope * row)[:, None]).astype(np.complex64))
+
+
+def test_a_known_tilt_is_taken_out_of_every_capture(bench):
+    fibrelets, slope = bench.calibration_fields.fibrelets, 2e4
+    known = Drift(np.zeros(1), np.zeros(1), np.array([[slope, 0.0]]), np.zeros((1, 3, 3)), np.zeros(2),
+                  np.zeros(2))  # fmt: skip
+    found = retrieve_fields(bench.recording, Tilted(METHOD, slope), fibrelets, drift=known)
+    usual = bench.recording_fields
+    assert np.linalg.norm(found.blank - usual.blank) < 0.02 * np.linalg.norm(usual.blank)
+    tilted = retrieve_fields(bench.recording, Tilted(METHOD, slope), fibrelets)
+    assert np.linalg.norm(tilted.blank - usual.blank) > 0.1 * np.linalg.norm(usual.blank)
 
 
 def test_jones_matrices_from_frames_are_the_samples(bench):
