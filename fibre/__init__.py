@@ -2,6 +2,7 @@
 
 from polinfer.storage import save
 
+from . import holograms
 from .bundle import Bundle
 from .drift import Drift, track_drift
 from .fibrelets import find_fibrelets
@@ -54,6 +55,7 @@ __all__ = [
     "TransportOfIntensity",
     "angular_spectrum",
     "find_fibrelets",
+    "holograms",
     "load",
     "reconstruct",
     "recover",

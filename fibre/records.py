@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -82,6 +83,11 @@ class Diversity:
         if self.distances is not None:
             distances = real_array("distances", self.distances, shape=(len(masks),), finite=True)
             object.__setattr__(self, "distances", distances)
+
+    @cached_property
+    def single_masks(self) -> np.ndarray:
+        """``masks`` in single precision, made once: a run asks for them again and again."""
+        return self.masks.astype(np.complex64)
 
 
 def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None) -> Diversity:
