@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import polinfer
 
 from .test_datasets import fibre_folder
@@ -53,3 +55,14 @@ def test_phantoms(tmp_path):
 def test_contrast(tmp_path):
     assert "gCNR" in run("06_contrast.py", tmp_path)
     assert (tmp_path / "contrast.png").stat().st_size > 10_000
+
+
+def test_microlenses(tmp_path):
+    folder = fibre_folder()
+    if not (folder / "tie_microlens").is_dir() and os.environ.get("POLINFER_REQUIRE_DATA") != "1":
+        pytest.skip(f"measured data are not here: {folder} has no tie_microlens")
+    said = run("08_microlens.py", tmp_path)
+    lengths = [float(line.split("f = ")[1].split()[0]) for line in said.splitlines() if line.startswith("lens ")]
+    assert len(lengths) == 6
+    assert max(lengths) < 1.04 * min(lengths)  # one array, one focal length
+    assert (tmp_path / "microlens.png").stat().st_size > 10_000
