@@ -109,7 +109,10 @@ def _pitch(image: np.ndarray) -> float:
     radius = np.hypot(fy[:, None], fx[None, :])
     bins = max(image.shape)
     ring = np.minimum((radius * bins).astype(int), bins)
-    total = np.bincount(ring.ravel(), power.ravel(), bins + 1)
+    # noise is in every ring in proportion to its size, and in a wide dark frame it is more than the lattice's light;
+    # half of the frequencies have less than log 2 of its mean
+    noise = np.median(power) / np.log(2)
+    total = np.bincount(ring.ravel(), power.ravel() - noise, bins + 1)
     frequency = (np.arange(bins + 1) + 0.5) / bins
     # envelope and shading live at low frequencies, noise is flat: look between 40 and 4 pixels of pitch
     allowed = (frequency > 2 / np.sqrt(3) / 40) & (frequency < 2 / np.sqrt(3) / 4)
@@ -132,9 +135,9 @@ def _peaks(image: np.ndarray, faintest: float) -> np.ndarray:
     heights = smooth[tuple(peaks.T)]
     order = np.argsort(-heights, kind="stable")
     peaks, heights = peaks[order], heights[order]
-    # typical is the maximum to which the brighter ones hold half of the light: noise in a wide dark margin has many
-    # maxima, but little light
-    light = np.cumsum(np.maximum(heights, 0))
+    # typical is the maximum to which the brighter ones hold half of the power: noise in a wide dark margin has many
+    # maxima, but little power
+    light = np.cumsum(np.maximum(heights - np.median(smooth), 0) ** 2)
     typical = heights[np.searchsorted(light, 0.5 * light[-1])]
     lit = heights > faintest * typical
     bright = heights > max(faintest, 0.3) * typical
