@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import jax
 import numpy as np
 import scipy.sparse
 
@@ -85,9 +86,9 @@ class Diversity:
             object.__setattr__(self, "distances", distances)
 
     @cached_property
-    def single_masks(self) -> np.ndarray:
-        """``masks`` in single precision, made once: a run asks for them again and again."""
-        return self.masks.astype(np.complex64)
+    def single_masks(self) -> jax.Array:
+        """``masks`` in single precision where JAX computes, made once: a run asks for them again and again."""
+        return jax.device_put(self.masks.astype(np.complex64))
 
 
 def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None) -> Diversity:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from tqdm import tqdm
 from fibre.records import Diversity, RetrievalStatus, Retrieved
 from polinfer.checks import one_of_types
 
-__all__ = ["RetrievalMethod", "Solution", "Stack", "misfit", "retrieve"]
+__all__ = ["RetrievalMethod", "Solution", "Stack", "judged", "measured_amplitudes", "misfit", "retrieve"]
 
 
 class RetrievalMethod(ABC):
@@ -33,32 +35,49 @@ class Stack:
     """What a method is given: the images of a small batch of b fields, checked, in single precision.
 
     intensities: float32 (b, m, y, x), as measured, so that noise may be negative. variance: float32, the same shape,
-    infinite = unusable, or None = unknown. amplitudes: their square roots, 0 for negative ones. weights: inverse
-    variances of the amplitudes relative to the best pixel's, 0 to 1, 0 = unusable. noise: (b,), the noise of the
-    amplitudes over the amplitudes (weighted), 0 where it is not known. masks: complex64 (m, y, x). distances: (m,)
-    metres, or None where the masks are others than defocus. wavelength, pixel_size: metres.
+    infinite = unusable, or None = unknown. masks: complex64 (m, y, x). distances: (m,) metres, or None where the masks
+    are others than defocus. wavelength, pixel_size: metres.
     """
 
     intensities: np.ndarray
     variance: np.ndarray | None
-    amplitudes: np.ndarray
-    weights: np.ndarray
-    noise: np.ndarray
     masks: np.ndarray
     distances: np.ndarray | None
     wavelength: float
     pixel_size: float
 
+    @cached_property
+    def measured(self) -> Measured:
+        """Amplitudes and their weights; made when a method asks first."""
+        return measured_amplitudes(self.intensities, self.variance)
+
+    @property
+    def amplitudes(self) -> np.ndarray:
+        """Square roots of the images, 0 for negative ones, float32 (b, m, y, x)."""
+        return np.asarray(self.measured.amplitudes)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Inverse variances of the amplitudes over the best pixel's, float32 (b, m, y, x): 0 to 1, 0 = unusable."""
+        return np.asarray(self.measured.weights)
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Noise of the amplitudes over the amplitudes (weighted), (b,); 0 where it is not known."""
+        return np.asarray(self.measured.noise)
+
 
 @dataclass(frozen=True)
 class Solution:
     """field: complex64 (b, y, x). converged: bool (b). iterations: int (b). variance: float32 (b, y, x) of the complex
-    field, where the method knows better than the floor that :func:`retrieve` states."""
+    field, where the method knows better than the floor that :func:`retrieve` states. misfitted: bool (b), where the
+    method has compared its field with the images; otherwise :func:`retrieve` does."""
 
     field: np.ndarray
     converged: np.ndarray
     iterations: np.ndarray
     variance: np.ndarray | None = None
+    misfitted: np.ndarray | None = None
 
 
 def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, progress: bool = False) -> Retrieved:
@@ -105,15 +124,15 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
         part = slice(start, min(start + batch, count))
         measured = intensities[part].astype(np.float32)
         uncertain = None if variance is None else variance[part].astype(np.float32)
-        amplitudes, weights, best = _weights(measured, uncertain)
-        noise = _relative_noise(amplitudes, weights, best)
         stack = Stack(
-            measured, uncertain, np.asarray(amplitudes), np.asarray(weights), np.asarray(noise), masks,
-            diversity.distances, diversity.wavelength, diversity.pixel_size,
-        )  # fmt: skip
+            measured, uncertain, np.asarray(masks), diversity.distances, diversity.wavelength, diversity.pixel_size
+        )
         found = method.solve(stack)
         field[part], iterations[part] = found.field, found.iterations
-        floor, misfitted = _noise(found.field, amplitudes, weights, best, masks)
+        if found.misfitted is None or uncertain is None:
+            floor, misfitted = judged(found.field, stack.measured, masks)
+        else:
+            floor, misfitted = np.asarray(_floor(measured, uncertain)), found.misfitted
         spread[part] = floor[:, None, None] if found.variance is None else found.variance
         status[part] = np.where(found.converged, 0, RetrievalStatus.NOT_CONVERGED)
         status[part] |= np.where(misfitted, RetrievalStatus.MISFIT, 0).astype(np.uint8)
@@ -126,26 +145,42 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
     )
 
 
+class Measured(NamedTuple):
+    """amplitudes, weights (b, m, y, x); best: the variance of weight 1, (b,), None where it is unknown; noise (b,)."""
+
+    amplitudes: jax.Array
+    weights: jax.Array
+    best: jax.Array | None
+    noise: jax.Array
+
+
+def _spread(intensities: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Variance of the amplitudes, and which are usable."""
+    usable = jnp.isfinite(variance)
+    variance = jnp.where(usable, variance, 1)
+    # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
+    return variance / (4 * jnp.maximum(intensities, jnp.sqrt(variance))), usable
+
+
 @jax.jit
-def _weights(intensities: jax.Array, variance: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array | None]:
-    """Amplitudes, their relative inverse variances, both (b, m, y, x), and the variance of weight 1, (b)."""
+def measured_amplitudes(intensities: jax.Array | np.ndarray, variance: jax.Array | np.ndarray | None) -> Measured:
+    """Amplitudes and weights of images (b, m, y, x)."""
     amplitudes = jnp.sqrt(jnp.maximum(intensities, 0))
     if variance is None:
-        return amplitudes, jnp.ones_like(amplitudes), None
-    usable = jnp.isfinite(variance)
-    deviation = jnp.sqrt(jnp.where(usable, variance, 1))
-    # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
-    spread = deviation**2 / (4 * jnp.maximum(amplitudes**2, deviation))
+        return Measured(amplitudes, jnp.ones_like(amplitudes), None, jnp.zeros(len(amplitudes), jnp.float32))
+    spread, usable = _spread(jnp.asarray(intensities), jnp.asarray(variance))
     best = jnp.where(usable, spread, jnp.inf).min((1, 2, 3))
-    return amplitudes, jnp.where(usable, best[:, None, None, None] / spread, 0), best
+    weights = jnp.where(usable, best[:, None, None, None] / spread, 0)
+    power = (weights * amplitudes**2).sum((1, 2, 3))
+    noise = jnp.sqrt(best * usable.sum((1, 2, 3)) / jnp.maximum(power, 1e-30))
+    return Measured(amplitudes, weights, best, noise)
 
 
 @jax.jit
-def _relative_noise(amplitudes: jax.Array, weights: jax.Array, best: jax.Array | None) -> jax.Array:
-    if best is None:
-        return jnp.zeros(len(amplitudes), jnp.float32)
-    power = (weights * amplitudes**2).sum((1, 2, 3))
-    return jnp.sqrt(best * (weights > 0).sum((1, 2, 3)) / jnp.maximum(power, 1e-30))
+def _floor(intensities: jax.Array, variance: jax.Array) -> jax.Array:
+    """Variance of the complex field that the image noise alone leaves, (b,)."""
+    spread, usable = _spread(intensities, variance)
+    return 2 * usable.sum((1, 2, 3)) / jnp.where(usable, 1 / spread, 0).sum((1, 2, 3)) / intensities.shape[1]
 
 
 @jax.jit
@@ -159,11 +194,15 @@ def misfit(field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, masks
     return np.asarray(_misfit(field, amplitudes, weights, masks))
 
 
+def judged(field: np.ndarray, measured: Measured, masks: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Variance (b,) of the complex field from the image noise, and whether the images are misfitted beyond it, (b,)."""
+    floor, misfitted = _judged(field, measured, masks)
+    return np.asarray(floor), np.asarray(misfitted)
+
+
 @jax.jit
-def _noise(
-    field: jax.Array, amplitudes: jax.Array, weights: jax.Array, best: jax.Array | None, masks: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Variance of the complex field from the image noise, and whether the images are misfitted beyond it."""
+def _judged(field: jax.Array, measured: Measured, masks: jax.Array) -> tuple[jax.Array, jax.Array]:
+    amplitudes, weights, best, _ = measured
     images = amplitudes.shape[1]
     left = _misfit(field, amplitudes, weights, masks)
     if best is None:

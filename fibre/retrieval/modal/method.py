@@ -11,7 +11,7 @@ import scipy.sparse.linalg
 import scipy.spatial
 
 from fibre.records import Fibrelets
-from fibre.retrieval.base import RetrievalMethod, Solution, Stack
+from fibre.retrieval.base import RetrievalMethod, Solution, Stack, judged, measured_amplitudes
 from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
 from fibre.retrieval.modal.newton import Coupling, Found, Problem, make_coupling, refine
 from fibre.retrieval.modal.start import Neighbours, make_neighbours, spreads, synchronise
@@ -90,25 +90,24 @@ class Modal(RetrievalMethod):
 
     def solve(self, stack: Stack) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
-        found = [self.amplitudes(stack, k) for k in range(len(stack.intensities))]
-        camera = _geometry(self, stack).camera
-        field = np.stack([camera.focus(one.amplitudes) for one in found])
-        converged = np.array([one.step <= max(self.tolerance, 2e-2) for one in found])
-        return Solution(field, converged, np.array([one.steps for one in found]))
-
-    def amplitudes(self, stack: Stack, k: int) -> Found:
-        """Amplitudes of field ``k`` of a stack, and what was found of the bench. Field in focus = sum of c times
-        modes of unit sum of squares over the camera's pixels."""
         geometry = _geometry(self, stack)
-        ones = np.ones(len(stack.masks))
+        coarse = [_coarse(stack, k, geometry.views.step) for k in range(len(stack.intensities))]
+        found = [self._found(stack, k, geometry, *one) for k, one in enumerate(coarse)]
+        field = np.stack([geometry.camera.focus(one.amplitudes) for one in found])
+        converged = np.array([one.step <= max(self.tolerance, 2e-2) for one in found])
+        misfitted = None
+        if stack.variance is not None:
+            misfitted = np.array([_misfits(one, geometry, *own) for one, own in zip(found, coarse, strict=True)])
+        return Solution(field, converged, np.array([one.steps for one in found]), misfitted=misfitted)
+
+    def _found(self, stack: Stack, k: int, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> Found:
+        """Amplitudes of field ``k``, and what was found of the bench, from images and variances of the coarse grid.
+
+        The field in focus is the sum of them times modes of unit sum of squares over the camera's pixels.
+        """
+        ones = np.ones(len(images))
         if not np.any(stack.intensities[k] > 0):
             return Found(np.zeros(len(self.fibrelets.centres), complex), 0.0, ones, 0.0, 0.0)
-        step = geometry.views.step
-        intensities = stack.intensities[k]
-        variance = _variance(intensities) if stack.variance is None else stack.variance[k]
-        known = np.isfinite(variance)
-        images = coarse_images(np.where(known, intensities, np.maximum(intensities, 0)), step)
-        spread = coarse_variance(variance, step)
         weights = np.where(np.isfinite(spread), 1 / spread, 0).astype(np.float32)
         turn = None
         if self.focus_spread > 0:
@@ -128,10 +127,8 @@ class Modal(RetrievalMethod):
     def _swept(self, stack: Stack, k: int, geometry: Geometry) -> np.ndarray:
         """Amplitudes from a few sweeps of all planes."""
         own = slice(k, k + 1)
-        one = replace(
-            stack, intensities=stack.intensities[own], amplitudes=stack.amplitudes[own], weights=stack.weights[own],
-            noise=stack.noise[own], variance=None if stack.variance is None else stack.variance[own],
-        )  # fmt: skip
+        variance = None if stack.variance is None else stack.variance[own]
+        one = replace(stack, intensities=stack.intensities[own], variance=variance)
         field = GerchbergSaxton(iterations=MOST, averaging=0, restarts=1).solve(one).field[0]
         camera = geometry.camera
         parts = camera.transposed @ field.reshape(-1, 1).view(np.float32)
@@ -186,6 +183,22 @@ def _made(key: _Key) -> Geometry:
     turn = (2 * np.pi * (np.sqrt(squared) - 1 / wavelength)).astype(np.float32)
     return Geometry(views, camera, make_coupling(tree, views, radii),
                     make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn)  # fmt: skip
+
+
+def _misfits(found: Found, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> bool:
+    """Whether images and field differ by more than noise, on the coarse grid, with the bench as it was found."""
+    views = geometry.views
+    measured = measured_amplitudes(images[None] / found.gains[:, None, None].astype(np.float32), spread[None])
+    turned = np.exp(1j * found.focus * geometry.turn).astype(np.complex64) if found.focus else np.complex64(1)
+    _, misfitted = judged(views.focus(found.amplitudes)[None], measured, views.masks * turned)
+    return bool(misfitted[0])
+
+
+def _coarse(stack: Stack, k: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+    """Images of field ``k`` and their variances on the coarse grid, (image, y, x)."""
+    intensities = stack.intensities[k]
+    variance = _variance(intensities) if stack.variance is None else stack.variance[k]
+    return coarse_images(intensities, step), coarse_variance(variance, step)
 
 
 def _variance(images: np.ndarray) -> np.ndarray:

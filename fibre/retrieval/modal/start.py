@@ -22,6 +22,7 @@ __all__ = ["Neighbours", "make_neighbours", "spreads", "synchronise"]
 
 FAINT = 0.02  # products of modes below this, of their own squares, are left out
 PAIRS = 8  # most pairs a fibrelet: beyond, images are no longer local enough
+RIDGE = 1e-3
 EDGE = 2.2  # radii, beyond which a mode's light is left out
 
 
@@ -33,7 +34,8 @@ class Neighbours:
     :math:`P_k = |c_k|^2` and products :math:`X_{kl} = c_k c_l^*`, h the mode k as image i sees it.
 
     planes: the images that are local enough. pairs: (p, 2) modes. design: sparse float32 (pixels of these images,
-    m + 2 p), columns of unit length. normal: its normal matrix. scale: (m + 2 p,) by which columns were divided.
+    m + 2 p), columns of unit length. normal: its normal matrix and a ridge. scale: (m + 2 p,), which divided the
+    columns.
     """
 
     planes: np.ndarray
@@ -42,12 +44,10 @@ class Neighbours:
     normal: scipy.sparse.csr_array
     scale: np.ndarray
 
-    def products(self, images: np.ndarray, ridge: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    def products(self, images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Powers (m,) and products (p,) that explain ``images`` (image, y, x) best."""
         right = self.design @ images[self.planes].ravel()
-        # the mean power of a column is 1: a small multiple of the unit matrix holds what no pixel sees
-        system = self.normal + ridge * scipy.sparse.eye_array(len(right), dtype=np.float32)
-        solution, _ = cg(system, right, rtol=3e-3, maxiter=60)
+        solution, _ = cg(self.normal, right, rtol=3e-3, maxiter=60)
         solution = solution / self.scale
         count = len(self.scale) - 2 * len(self.pairs)
         real, imaginary = np.split(solution[count:], 2)
@@ -90,7 +90,9 @@ def make_neighbours(
     design = scipy.sparse.vstack(rows).tocsc()
     scale = np.sqrt(np.maximum(np.asarray(design.power(2).sum(axis=0)).ravel(), 1e-30))
     design = scipy.sparse.csr_array((design @ scipy.sparse.diags_array(1 / scale)).T).astype(np.float32)
-    return Neighbours(planes, pairs, design, scipy.sparse.csr_array(design @ design.T), scale)
+    # columns have length 1: a small multiple of the unit matrix holds what no pixel sees
+    normal = design @ design.T + RIDGE * scipy.sparse.eye_array(design.shape[0], dtype=np.float32)
+    return Neighbours(planes, pairs, design, scipy.sparse.csr_array(normal), scale)
 
 
 def _equations(

@@ -100,6 +100,8 @@ def coarse_images(images: np.ndarray, step: int) -> np.ndarray:
 
 def coarse_variance(variance: np.ndarray, step: int) -> np.ndarray:
     """Variance of :func:`coarse_images` from that of the camera's pixels, infinite where one is unusable."""
-    few = tuple(s // step for s in variance.shape[-2:])
-    parts = variance.reshape(len(variance), few[0], step, few[1], step)
-    return parts.mean(axis=(2, 4)) / step**2
+    if step == 1:
+        return variance
+    # strided sums: a mean over two axes of a five-dimensional view takes three times as long
+    parts = (variance[:, i::step, j::step] for i in range(step) for j in range(step))
+    return np.asarray(sum(parts, np.float32(0)) / step**4, np.float32)
