@@ -109,7 +109,8 @@ def main(size: int | None = None, full: bool = False) -> None:
                         pairs=seconds / pair_seconds, first_seconds=first)  # fmt: skip
         slow, best = found["GerchbergSaxton, 200"], found["Modal"]
         text = f"{photons:g} photons"
-        results.bar(f"{text}: time of Modal over that of 200 sweeps", best[0] / slow[0], 1 / 50)
+        quickest = min(spent for name, (spent, off) in found.items() if name.startswith("Modal") and off <= slow[1])
+        results.bar(f"{text}: time to the error of 200 sweeps, over theirs", quickest / slow[0], 1 / 50)
         results.bar(f"{text}: error of Modal over that of 200 sweeps", best[1] / slow[1], 1.0)
         least = min(value for name, (_, value) in found.items() if "Gerchberg" in name)
         results.bar(f"{text}: error of Modal over the least of Gerchberg-Saxton", best[1] / least, 0.5)
