@@ -12,6 +12,7 @@ import jax
 QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
 ALL = (
     *QUICK,
+    "bundle",
     "peers",
     "chain",
     "parts",

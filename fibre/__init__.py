@@ -32,6 +32,7 @@ from .retrieval.base import retrieve
 from .retrieval.gerchberg_saxton import GerchbergSaxton
 from .retrieval.modal import Modal
 from .retrieval.transport_of_intensity import TransportOfIntensity
+from .transmission import Frame, Transmission
 
 __all__ = [
     "Accelerated",
@@ -42,6 +43,7 @@ __all__ = [
     "Diversity",
     "Drift",
     "Fibrelets",
+    "Frame",
     "GerchbergSaxton",
     "Images",
     "Interference",
@@ -52,6 +54,7 @@ __all__ = [
     "RetrievalStatus",
     "Retrieved",
     "Ridge",
+    "Transmission",
     "TransportOfIntensity",
     "angular_spectrum",
     "find_fibrelets",

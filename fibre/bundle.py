@@ -1,12 +1,12 @@
 """Forward model of the fibre bundle: cores on a jittered hexagonal lattice, coupled to their neighbours.
 
-In: amplitudes of the fibrelet modes at the distal facet. Out: amplitudes at the proximal facet, and the camera's
-view of them at any defocus. Called by the simulated bench and by tests of recovery.
+In: amplitudes of the fibrelet modes at the distal facet, or fields in front of it. Out: amplitudes at the proximal
+facet, and the camera's view of them at any defocus. Called by the simulated bench and by tests of recovery.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,9 @@ import scipy.fft
 import scipy.sparse
 import scipy.spatial
 
+from fibre.evolution import Evolution
 from fibre.propagation import transfer_function
+from fibre.transmission import Frame, Transmission
 from polinfer.checks import as_generator, complex_array, integer, real_array, real_number
 from polinfer.storage import array
 
@@ -28,29 +30,36 @@ class Bundle:
 
     The amplitudes (h, v) of core k at the distal facet arrive at the proximal facet as :math:`c' = T c` with
 
-    .. math:: T = e^{i L K}
+    .. math:: T = e^{i K}, \quad K = L \, (\beta + \text{coupling})
 
-    and the Hermitian K holds each core's propagation constant and birefringence on its 2 x 2 diagonal blocks and the
-    coupling to its nearest neighbours beside them. T is kept as a sparse matrix: coupling is local.
+    and the Hermitian K, of the fibre's whole length L, holds each core's propagation constant and birefringence on its
+    2 x 2 diagonal blocks and the coupling to its nearest neighbours beside them. T is applied and never formed
+    (:class:`fibre.evolution.Evolution`).
 
     Parameters
     ----------
-    centres: (m, 2) metres, (row, column). mode_radius: (m,) metres, 1/e field radius of the Gaussian mode.
-    transfer: sparse complex (2 m, 2 m), rows and columns ordered h of all cores, then v of all cores.
-    wavelength: metres, in vacuum.
+    centres: (m, 2) metres, (row, column), of the cores at the proximal facet, which the camera sees. mode_radius: (m,)
+    metres, 1/e field radius of the Gaussian mode. coupling: K, sparse Hermitian (2 m, 2 m) in radians, rows and columns
+    ordered h of all cores, then v. wavelength: metres, in vacuum. distal_centres: (m, 2) metres at the distal facet;
+    None: as at the proximal one.
+
+    Raises
+    ------
+    ValueError: shapes that do not fit, values that are not finite, a coupling that is not Hermitian.
 
     Source: coupled-mode theory of multicore fibres; lattice after imaging bundles of about 4.5 um pitch.
 
     >>> bundle = Bundle.hexagonal(radius=20e-6, rng=0)
-    >>> far = bundle.propagate(np.ones((2, bundle.cores)))
-    >>> bool(np.isclose(np.linalg.norm(far) ** 2, 2 * bundle.cores, rtol=1e-3))  # lossless
+    >>> far = bundle.transmit(np.ones((2, bundle.cores)))
+    >>> bool(np.isclose(np.linalg.norm(far) ** 2, 2 * bundle.cores))  # lossless
     True
     """
 
     centres: np.ndarray = array(("core", "row_column"), "m")
     mode_radius: np.ndarray = array(("core",), "m")
-    transfer: Any = array(("row", "column"), "1")
+    coupling: Any = array(("row", "column"), "rad")
     wavelength: float = 850e-9
+    distal_centres: np.ndarray = array(("core", "row_column"), "m", default=None)
 
     def __post_init__(self) -> None:
         centres = real_array("centres", self.centres, shape=(None, 2), finite=True)
@@ -59,9 +68,15 @@ class Bundle:
         object.__setattr__(
             self, "mode_radius", real_array("mode_radius", self.mode_radius, shape=(m,), above=0, finite=True)
         )
-        if not scipy.sparse.issparse(self.transfer) or self.transfer.shape != (2 * m, 2 * m):
-            raise ValueError(f"transfer must be a sparse matrix of shape ({2 * m}, {2 * m}) for {m} cores.")
-        object.__setattr__(self, "transfer", scipy.sparse.csr_array(self.transfer))
+        distal: Any = centres if self.distal_centres is None else self.distal_centres
+        object.__setattr__(self, "distal_centres", real_array("distal_centres", distal, shape=(m, 2), finite=True))
+        if not scipy.sparse.issparse(self.coupling) or self.coupling.shape != (2 * m, 2 * m):
+            raise ValueError(f"coupling must be a sparse matrix of shape ({2 * m}, {2 * m}) for {m} cores.")
+        coupling = scipy.sparse.csr_array(self.coupling)
+        skew = coupling - coupling.conj().T
+        if not np.all(np.isfinite(coupling.data)) or np.any(np.abs(skew.data) > 1e-9 * np.abs(coupling.data).max()):
+            raise ValueError("coupling must be finite and Hermitian: what one core gives, the other gives back.")
+        object.__setattr__(self, "coupling", coupling)
         real_number("wavelength", self.wavelength, above=0)
 
     @classmethod
@@ -76,6 +91,7 @@ class Bundle:
         birefringence: float = 2.0,
         coupling: float = 0.25,
         wavelength: float = 850e-9,
+        registration: Any = None,
         rng: int | np.random.Generator | None = None,
     ) -> Bundle:
         """A round bundle on a hexagonal lattice.
@@ -83,7 +99,8 @@ class Bundle:
         ``radius``, ``pitch``, ``jitter`` (standard deviation of each coordinate), ``mode_radius``, ``wavelength`` in
         metres; ``mode_spread`` relative. The fibre's length is contained in the three dimensionless products
         ``detuning`` (spread of propagation constants times length, radians), ``birefringence`` (per core, radians)
-        and ``coupling`` (between touching neighbours, radians).
+        and ``coupling`` (between touching neighbours, radians). ``registration``: affine map (2, 3) from the proximal
+        facet to the distal one, whose lattice may lie turned, larger and shifted; None: the same.
         """
         generator, _ = as_generator(rng)
         radius = real_number("radius", radius, above=0)
@@ -97,8 +114,11 @@ class Bundle:
         m = len(lattice)
         centres = lattice + real_number("jitter", jitter, low=0) * generator.standard_normal((m, 2))
         radii = mode_radius * (1 + mode_spread * generator.standard_normal(m))
-        generator_matrix = _couplings(centres, pitch, detuning, birefringence, coupling, generator)
-        return cls(centres, radii, _exponential(1j * generator_matrix), wavelength)
+        matrix = _couplings(centres, pitch, detuning, birefringence, coupling, generator)
+        if registration is None:
+            return cls(centres, radii, matrix, wavelength)
+        affine = real_array("registration", registration, shape=(2, 3), finite=True)
+        return cls(centres, radii, matrix, wavelength, centres @ affine[:, :2].T + affine[:, 2])
 
     @property
     def cores(self) -> int:
@@ -106,24 +126,92 @@ class Bundle:
         return len(self.centres)
 
     @cached_property
-    def _adjoint_transfer(self) -> Any:
-        return self.transfer.conj().T.tocsr()
+    def evolution(self) -> Evolution:
+        """The exponential of the coupling."""
+        return Evolution.of(self.coupling)
 
-    def _apply(self, matrix: Any, name: str, amplitudes: Any) -> np.ndarray:
-        amplitudes = complex_array(name, amplitudes, trailing=(2, self.cores))
-        flat = amplitudes.reshape(-1, 2 * self.cores)
-        return np.asarray((matrix @ flat.T).T).reshape(amplitudes.shape)
+    @cached_property
+    def transfer(self) -> scipy.sparse.csc_array:
+        """T as a sparse matrix (2 m, 2 m), entries below 1e-9 left out: for small bundles. Each core reaches some
+        hundred others, so ten thousand cores take minutes and hundreds of megabytes, where :meth:`transmit` takes
+        milliseconds."""
+        return self.columns(scipy.sparse.eye_array(2 * self.cores, format="csc"), faint=1e-9)
 
-    def propagate(self, amplitudes: Any) -> np.ndarray:
+    def columns(self, launched: Any, faint: float = 0.0) -> scipy.sparse.csc_array:
+        """T times sparse columns of amplitudes (2 m, w), sparse; entries of modulus below ``faint`` left out."""
+        launched = scipy.sparse.csc_array(launched)
+        if launched.shape[0] != 2 * self.cores:
+            raise ValueError(f"launched must have {2 * self.cores} rows, got shape {launched.shape}.")
+        parts = []
+        for start in range(0, launched.shape[1], 128):
+            part = self.evolution.apply(launched[:, start : start + 128].toarray())
+            part[np.abs(part) < faint] = 0
+            parts.append(scipy.sparse.csc_array(part))
+        return scipy.sparse.csc_array(scipy.sparse.hstack(parts, format="csc"))
+
+    def disturbed(self, piston: float = 0.0, tilt: tuple[float, float] = (0.0, 0.0), heating: float = 0.0) -> Bundle:
+        r"""The bundle after slow bending and warming.
+
+        .. math:: K' = (1 + \text{heating}) K + \text{piston} + \text{tilt} \cdot r
+
+        A bend of the whole fibre makes the cores on its outer side longer in proportion to their place r: radians per
+        metre along (row, column). ``heating`` is the relative change of the optical length beyond what all cores have
+        in common, which is the ``piston``, radians.
+        """
+        row, column = (real_number("tilt", t) for t in tilt)
+        extra = real_number("piston", piston) + self.centres @ [row, column]
+        diagonal = scipy.sparse.diags_array(np.concatenate([extra, extra]))
+        return replace(self, coupling=(1 + real_number("heating", heating, above=-1)) * self.coupling + diagonal)
+
+    def transmit(self, amplitudes: Any) -> np.ndarray:
         """Mode amplitudes at the proximal facet, complex (*B, 2, m), from those at the distal facet, (*B, 2, m)."""
-        return self._apply(self.transfer, "amplitudes", amplitudes)
+        return self._evolved(amplitudes, 1)
 
-    def adjoint(self, amplitudes: Any) -> np.ndarray:
-        """The adjoint of :meth:`propagate`: <T x, y> = <x, T* y>. Shapes (*B, 2, m)."""
-        return self._apply(self._adjoint_transfer, "amplitudes", amplitudes)
+    def transmit_adjoint(self, amplitudes: Any) -> np.ndarray:
+        """The adjoint of :meth:`transmit`, which is its inverse: <T x, y> = <x, T* y>. Shapes (*B, 2, m)."""
+        return self._evolved(amplitudes, -1)
+
+    def _evolved(self, amplitudes: Any, sign: int) -> np.ndarray:
+        amplitudes = complex_array("amplitudes", amplitudes, trailing=(2, self.cores))
+        columns = np.ascontiguousarray(amplitudes.reshape(-1, 2 * self.cores).T)
+        return np.ascontiguousarray(self.evolution.apply(columns, sign).T).reshape(amplitudes.shape)
+
+    def propagate(
+        self, fields: Any, sample: Frame, camera: Frame | None = None, distance: float = 0.0, defocus: float = 0.0
+    ) -> np.ndarray:
+        """Fields at the camera, complex (*B, 2, y, x), from fields at the sample plane (*B, 2, y, x).
+
+        ``sample``, ``camera`` (None: the same): :class:`fibre.Frame`, on which they are sampled. ``distance``: metres
+        from the sample to the distal facet; ``defocus``: metres from the proximal facet to the plane that the camera
+        sees. See :class:`fibre.Transmission`; the geometry is kept for the next call with the same frames.
+        """
+        return self._between(sample, camera, distance, defocus).propagate(fields)
+
+    def adjoint(
+        self, fields: Any, sample: Frame, camera: Frame | None = None, distance: float = 0.0, defocus: float = 0.0
+    ) -> np.ndarray:
+        """The adjoint of :meth:`propagate`: fields at the camera (*B, 2, y, x) to fields at the sample plane."""
+        return self._between(sample, camera, distance, defocus).adjoint(fields)
+
+    def matrix(
+        self, window: Any, sample: Frame, camera: Frame | None = None, distance: float = 0.0
+    ) -> scipy.sparse.csc_array:
+        """The columns of the transmission matrix of the sample's pixels in ``window``, boolean (y, x): sparse (2 y x of
+        the camera, 2 w). See :meth:`fibre.Transmission.matrix`."""
+        return self._between(sample, camera, distance, 0.0).matrix(window)
+
+    def _between(self, sample: Frame, camera: Frame | None, distance: float, defocus: float) -> Transmission:
+        wanted = (sample, sample if camera is None else camera, distance, defocus)
+        kept: tuple[Any, Transmission] | None = self.__dict__.get("_last")
+        if kept is None or kept[0] != wanted:
+            kept = (wanted, Transmission(self, *wanted))
+            self.__dict__["_last"] = kept
+        return kept[1]
 
     def launch(self, points: Any, waist: float) -> scipy.sparse.csr_array:
-        r"""Amplitude that a unit-power Gaussian spot at each point launches in each core, sparse real (m, p).
+        r"""Amplitude that a unit-power Gaussian spot at each point of the distal facet launches in each core.
+
+        Sparse real (m, p):
 
         .. math:: \frac{2 w w_k}{w^2 + w_k^2} e^{-|r - r_k|^2 / (w^2 + w_k^2)}
 
@@ -132,11 +220,11 @@ class Bundle:
         points = real_array("points", points, shape=(None, 2), finite=True)
         waist = real_number("waist", waist, above=0)
         reach = 4 * np.sqrt(waist**2 + self.mode_radius.max() ** 2)
-        tree = scipy.spatial.cKDTree(self.centres)
+        tree = scipy.spatial.cKDTree(self.distal_centres)
         near = tree.query_ball_point(points, reach)
         column = np.repeat(np.arange(len(points)), [len(n) for n in near])
         row = np.concatenate([np.asarray(n, int) for n in near]) if len(column) else np.zeros(0, int)
-        distance2 = ((points[column] - self.centres[row]) ** 2).sum(1)
+        distance2 = ((points[column] - self.distal_centres[row]) ** 2).sum(1)
         width2 = waist**2 + self.mode_radius[row] ** 2
         values = 2 * waist * self.mode_radius[row] / width2 * np.exp(-distance2 / width2)
         return scipy.sparse.csr_array((values, (row, column)), shape=(self.cores, len(points)))
@@ -216,23 +304,3 @@ def _couplings(
     vv = scipy.sparse.diags_array(common - splitting * np.cos(2 * axis)) + neighbours
     hv = scipy.sparse.diags_array(-splitting * np.sin(2 * axis))
     return scipy.sparse.csr_array(scipy.sparse.block_array([[hh, hv], [hv, vv]]))
-
-
-def _exponential(matrix: Any, tolerance: float = 1e-7) -> scipy.sparse.csr_array:
-    """Exponential of a sparse matrix by scaling and squaring, entries below ``tolerance`` dropped at each squaring.
-
-    The exponential of a local coupling is local, but scipy's exact one fills with rounding dust and is ten times
-    slower. Each squaring doubles the error of the last, so it stays below 1e-4 in norm at the sizes met here.
-    """
-    norm = max(float(abs(matrix).sum(axis=1).max()), 1e-300)
-    squarings = max(0, int(np.ceil(np.log2(norm / 0.25))))
-    step = scipy.sparse.csr_array(matrix) / 2**squarings
-    term = total = scipy.sparse.csr_array(scipy.sparse.eye_array(matrix.shape[0], dtype=complex))
-    for order in range(1, 9):
-        term = term @ step / order
-        total = total + term
-    for _ in range(squarings):
-        total = total @ total
-        total.data[np.abs(total.data) < tolerance] = 0
-        total.eliminate_zeros()
-    return scipy.sparse.csr_array(total)

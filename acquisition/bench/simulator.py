@@ -46,9 +46,16 @@ class SimulatedBench:
         settings = {
             f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
         }
-        bundle, transfer = self.scene.bundle, self.scene.bundle.transfer
+        bundle, coupling = self.scene.bundle, self.scene.bundle.coupling
         digest = hashlib.sha256()
-        for part in (self._sample[0], bundle.centres, bundle.mode_radius, transfer.data, transfer.indices):
+        for part in (
+            self._sample[0],
+            bundle.centres,
+            bundle.mode_radius,
+            bundle.distal_centres,
+            coupling.data,
+            coupling.indices,
+        ):
             digest.update(np.ascontiguousarray(part).tobytes())
         settings["wavelength"] = self.wavelength
         described = {"bench": "simulated", "seed": self.seed, "scene": settings, "contents": digest.hexdigest()}
@@ -73,7 +80,7 @@ class SimulatedBench:
             places, light, jones, waist = self._sample[1:]
             field = light[:, None] * state if step.kind == "blank" else light[:, None] * (jones @ state)
             launched += (scene.bundle.launch(places, waist) @ field).T
-        self._rates = self._views(scene.bundle.propagate(launched), views, step)
+        self._rates = self._views(scene.bundle.transmit(launched), views, step)
         self._step = step
 
     def expose(self, view: int, exposure: float) -> np.ndarray:

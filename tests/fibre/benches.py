@@ -48,14 +48,14 @@ class Small:
     def seen(self, spots):
         """True amplitudes (2, m), in sqrt(photo-electrons/s), of distal fields (2, p) at the points."""
         bundle, launch = self.scene.bundle, self.scene.bundle.launch(PLAN.points, self.scene.spot_waist)
-        return bundle.propagate((launch @ spots.T).T) * np.sqrt(self.scene.spot_power)
+        return bundle.transmit((launch @ spots.T).T) * np.sqrt(self.scene.spot_power)
 
     @property
     def reference(self):
         """True amplitudes of the reference spot, (2, m)."""
         bundle = self.scene.bundle
         spot = bundle.launch(np.array([self.scene.reference]), self.scene.spot_waist).toarray()[:, 0]
-        return bundle.propagate(np.stack([spot, spot]) / np.sqrt(2)) * np.sqrt(self.scene.spot_power)
+        return bundle.transmit(np.stack([spot, spot]) / np.sqrt(2)) * np.sqrt(self.scene.spot_power)
 
 
 def small(folder):

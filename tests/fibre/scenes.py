@@ -77,7 +77,7 @@ def scene(grid=(8, 8), stride=4, states=3, radius=25e-6, reference=(0.0, 22e-6))
     launch = bundle.launch(plan.points, WAIST)
     matrix = (bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray()
     spot = bundle.launch(np.array([reference]), WAIST).toarray()[:, 0]
-    return Scene(bundle, plan, matrix, bundle.propagate(np.stack([spot, spot]) / np.sqrt(2)))
+    return Scene(bundle, plan, matrix, bundle.transmit(np.stack([spot, spot]) / np.sqrt(2)))
 
 
 def without_noise(record):

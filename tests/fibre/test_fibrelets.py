@@ -221,7 +221,7 @@ def test_modes_have_unit_power_and_overlap_as_gaussians_do(bundle):
 
 
 def test_modes_are_those_of_the_bundles_image(bundle):
-    same = Bundle(bundle.centres, np.full(bundle.cores, 1.6e-6), bundle.transfer)
+    same = Bundle(bundle.centres, np.full(bundle.cores, 1.6e-6), bundle.coupling)
     c = np.random.default_rng(1).normal(size=(2, bundle.cores)) + 0j
     seen = same.image(c, SHAPE, PIXEL)[1] * PIXEL
     made = (mode_matrix(Fibrelets(same.centres, 1.6e-6), SHAPE, PIXEL) @ c[1]).reshape(SHAPE)

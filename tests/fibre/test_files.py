@@ -106,7 +106,7 @@ def test_a_sparse_matrix_with_entries_out_of_range_is_refused(records, tmp_path)
 
     path = save(records["Bundle"], tmp_path / "bundle.nc")
     dataset = xarray.load_dataset(path, engine="h5netcdf", mask_and_scale=False)
-    dataset["transfer.indices"].values[3] = 10_000
+    dataset["coupling.indices"].values[3] = 10_000
     dataset.to_netcdf(tmp_path / "bad.nc", engine="h5netcdf")
     with pytest.raises(ValueError, match=r"bad\.nc"):
         load(tmp_path / "bad.nc")
