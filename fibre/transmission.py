@@ -37,6 +37,7 @@ FAINT = 1e-6  # entries of a window's matrix below this, of its largest, are lef
 class Frame:
     """Square pixels on which a field is sampled. shape: (y, x). pixel_size: metres. The axis is the middle.
 
+    >>> from fibre import Frame
     >>> Frame((4, 6), 1e-6).points[0].tolist()
     [-1.5e-06, -2.5e-06]
     """
