@@ -209,6 +209,16 @@ def _scaled(drift: Drift) -> _Walk:
     return _Walk(drift.times, mean / unit, drift.covariance / np.outer(unit, unit), rates, unit)
 
 
+def _updated(
+    mean: np.ndarray, spread: np.ndarray, measured: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Kalman's update of a state (3,) and its covariance by a measurement of all of it; in Joseph's form, in which the
+    covariance stays one."""
+    gain = spread @ np.linalg.pinv(spread + noise, hermitian=True)
+    rest = np.eye(3) - gain
+    return mean + gain @ (measured - mean), rest @ spread @ rest.T + gain @ noise @ gain.T
+
+
 def _smooth(walk: _Walk, wanted: np.ndarray) -> States:
     """Kalman filter and smoother over the references' times and the wanted ones."""
     times = np.unique(np.concatenate([walk.times, wanted]))
@@ -220,10 +230,7 @@ def _smooth(walk: _Walk, wanted: np.ndarray) -> States:
         spread = spread + np.diag(walk.rates * step)
         predicted.append((mean, spread))
         if (k := measured.get(float(time))) is not None:
-            gain = spread @ np.linalg.pinv(spread + walk.covariance[k], hermitian=True)
-            mean = mean + gain @ (walk.mean[k] - mean)
-            rest = np.eye(3) - gain
-            spread = rest @ spread @ rest.T + gain @ walk.covariance[k] @ gain.T
+            mean, spread = _updated(mean, spread, walk.mean[k], walk.covariance[k])
         filtered.append((mean, spread))
     result = [filtered[-1]]
     for k in range(len(times) - 2, -1, -1):
@@ -255,10 +262,8 @@ def _rates(times: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.nd
             spread = spread + np.diag(rates * (times[k] - times[k - 1]))
             whole = spread + covariance[k]
             left = mean[k] - state
-            gain = np.linalg.solve(whole, spread).T
             total += float(left @ np.linalg.solve(whole, left) + np.linalg.slogdet(whole)[1])
-            state = state + gain @ left
-            spread = (np.eye(3) - gain) @ spread
+            state, spread = _updated(state, spread, mean[k], covariance[k])
         return total
 
     steps = np.diff(mean, axis=0) ** 2 / np.diff(times)[:, None]

@@ -6,6 +6,7 @@ with its variance. Called by ``retrieve_fields``, which keeps fields in this bas
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import scipy.spatial
 from fibre.records import Fibrelets
 from polinfer.checks import complex_array, real_array, real_number
 
-__all__ = ["find_fibrelets", "locate_fibrelets", "mode_amplitudes", "mode_matrix"]
+__all__ = ["ModeBasis", "find_fibrelets", "locate_fibrelets", "mode_matrix"]
 
 
 def find_fibrelets(image: Any) -> np.ndarray:
@@ -195,24 +196,46 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     return scipy.sparse.csr_array((values[inside], (row, mode[inside])), shape=(shape[0] * shape[1], len(pixel)))
 
 
-def mode_amplitudes(
-    field: Any, variance: Any, modes: scipy.sparse.csr_array, prior_power: float
-) -> tuple[np.ndarray, np.ndarray]:
-    r"""Amplitudes c of the modes G in one field by weighted least squares with a weak prior.
+class ModeBasis:
+    """The modes of a frame (:func:`mode_matrix`), ready for weighted least squares of many fields."""
 
-    .. math:: \min_c \sum_x |E(x) - (G c)(x)|^2 / \mathrm{var}(x) + |c|^2 / P
+    def __init__(self, modes: scipy.sparse.csr_array) -> None:
+        self.modes = modes
+        self.transposed = scipy.sparse.csr_array(modes.T)
+        self._squares = self.transposed.power(2)
 
-    ``field`` complex (y, x); ``variance`` real (y, x), infinite where the field says nothing; ``prior_power`` P, what
-    a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,) and the
-    variance (m,): one over the diagonal of the normal matrix, which neighbours that overlap by a few per cent leave
-    right to the square of that.
-    """
-    field = complex_array("field", field, shape=(None, None))
-    variance = real_array("variance", variance, shape=field.shape, above=0)
-    usable = np.isfinite(variance)
-    weight = np.where(usable, 1 / variance, 0).ravel()
-    known = np.where(usable, field, 0).ravel()
-    weighted = modes.T @ scipy.sparse.diags_array(weight)
-    normal = (weighted @ modes + scipy.sparse.diags_array(np.full(modes.shape[1], 1 / prior_power))).tocsc()
-    amplitudes = scipy.sparse.linalg.splu(normal).solve(np.stack([(weighted @ known).real, (weighted @ known).imag], 1))
-    return amplitudes[:, 0] + 1j * amplitudes[:, 1], 1 / normal.diagonal()
+    @cached_property
+    def _gram(self) -> scipy.sparse.csr_array:
+        return scipy.sparse.csr_array(self.transposed @ self.modes)
+
+    def _normal(self, weight: np.ndarray) -> scipy.sparse.csr_array:
+        """G^T diag(weight) G."""
+        if weight.min() == weight.max():
+            return self._gram * float(weight[0])
+        rows = self.transposed
+        weighted = scipy.sparse.csr_array((rows.data * weight[rows.indices], rows.indices, rows.indptr), rows.shape)
+        return scipy.sparse.csr_array(weighted @ self.modes)
+
+    def amplitudes(self, field: Any, variance: Any, prior_power: float) -> tuple[np.ndarray, np.ndarray]:
+        r"""Amplitudes c of the modes G in one field by weighted least squares with a weak prior.
+
+        .. math:: \min_c \sum_x |E(x) - (G c)(x)|^2 / \mathrm{var}(x) + |c|^2 / P
+
+        ``field`` complex (y, x); ``variance`` real (y, x), infinite where the field says nothing; ``prior_power`` P,
+        what a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,)
+        and the variance (m,): one over the diagonal of the normal matrix, which neighbours that overlap by a few per
+        cent leave right to the square of that.
+        """
+        field = complex_array("field", field, shape=(None, None))
+        variance = real_array("variance", variance, shape=field.shape, above=0)
+        usable = np.isfinite(variance)
+        weight = np.where(usable, 1 / variance, 0).ravel()
+        known = weight * np.where(usable, field, 0).ravel()
+        diagonal = self._squares @ weight + 1 / prior_power
+        # scaled to a diagonal of ones; neighbours overlap by a few per cent, so that a dozen steps are exact
+        scale = scipy.sparse.diags_array(1 / np.sqrt(diagonal))
+        normal = scale @ self._normal(weight) @ scale
+        normal += scipy.sparse.diags_array(1 / (prior_power * diagonal))
+        right = (self.transposed @ np.stack([known.real, known.imag], axis=1)) / np.sqrt(diagonal)[:, None]
+        parts = [scipy.sparse.linalg.cg(normal, column, rtol=1e-12, maxiter=200)[0] for column in right.T]
+        return (parts[0] + 1j * parts[1]) / np.sqrt(diagonal), 1 / diagonal

@@ -7,7 +7,8 @@ illumination states has checked. Called by users and by the ``retrieve`` command
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import overload
 
 import numpy as np
@@ -15,7 +16,7 @@ from tqdm import tqdm
 
 from fibre.closure import closure_errors, closure_phases, noise_scale
 from fibre.drift import Drift
-from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
+from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
     Calibration,
@@ -28,6 +29,8 @@ from fibre.records import (
 )
 from fibre.retrieval.base import RetrievalMethod, retrieve
 from polinfer.checks import one_of_types
+from polinfer.kept import Kept, fingerprint
+from polinfer.storage import array
 
 __all__ = ["fibrelets_of", "retrieve_fields"]
 
@@ -37,9 +40,9 @@ class _Amplitudes:
     """Mode amplitudes of some captures, complex (captures, 2, m), the variance that the image noise explains, and the
     retrieval's status (captures,)."""
 
-    values: np.ndarray
-    variance: np.ndarray
-    status: np.ndarray
+    values: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
+    variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
+    status: np.ndarray = array(("capture",), "1")
 
     def of(self, captures: np.ndarray) -> _Amplitudes:
         """Some of the captures."""
@@ -52,7 +55,7 @@ class _Amplitudes:
 
     def turned(self, phases: np.ndarray) -> _Amplitudes:
         """Every capture turned by its phase, radians."""
-        return _Amplitudes(self.values * np.exp(1j * phases)[:, None, None], self.variance, self.status)
+        return replace(self, values=self.values * np.exp(1j * phases)[:, None, None])
 
     def closed(self, reference: np.ndarray, states: np.ndarray) -> _Amplitudes:
         """Captures of one scene in several states, turned so that the states close best."""
@@ -85,6 +88,7 @@ def retrieve_fields(
     fibrelets: Fibrelets | None = None,
     progress: bool = False,
     drift: Drift | None = None,
+    folder: str | Path | None = None,
 ) -> CalibrationFields: ...
 @overload
 def retrieve_fields(
@@ -93,6 +97,7 @@ def retrieve_fields(
     fibrelets: Fibrelets | None = None,
     progress: bool = False,
     drift: Drift | None = None,
+    folder: str | Path | None = None,
 ) -> RecordingFields: ...
 def retrieve_fields(
     record: Calibration | Recording,
@@ -100,6 +105,7 @@ def retrieve_fields(
     fibrelets: Fibrelets | None = None,
     progress: bool = False,
     drift: Drift | None = None,
+    folder: str | Path | None = None,
 ) -> CalibrationFields | RecordingFields:
     r"""Fields of every capture, in fibrelet modes, with variance.
 
@@ -121,11 +127,14 @@ def retrieve_fields(
     are; a calibration finds them in its own images (None), a recording must be given its calibration's. progress:
     show a bar. drift: piston and tilt against time (:func:`fibre.track_drift`), taken out of every capture and
     reference at its time, and counted in the variance; the reference spot sets the piston in any case, so that it is
-    the tilt that this is for. None: the fibre holds still but for pistons.
+    the tilt that this is for. None: the fibre holds still but for pistons. folder: where the amplitudes of finished
+    captures are kept (made if absent), so that the same call goes on where it was interrupted; None: nowhere. The
+    folder belongs to one method, set of fibrelets and record, which is known by its shape, times and settings and by
+    the images of its first and last capture.
 
     Raises
     ------
-    TypeError, ValueError: a record of another kind; a recording without ``fibrelets``.
+    TypeError, ValueError: a record of another kind; a recording without ``fibrelets``; a folder of another call.
     """
     one_of_types("record", record, (Calibration, Recording), "pass a Calibration or a Recording.")
     if drift is not None:
@@ -133,11 +142,10 @@ def retrieve_fields(
     if isinstance(record, Calibration):
         if fibrelets is None:
             fibrelets = fibrelets_of(record)
-        reference = _retrieve(record.references, method, fibrelets, progress, "reference", drift)
+        run = _Run(method, fibrelets, progress, drift, folder)
+        reference = run.amplitudes(record.references, "reference")
         mean_reference = _mean_reference(reference)
-        fields = _retrieve(record.images, method, fibrelets, progress, "calibration", drift).in_phase_with(
-            mean_reference
-        )
+        fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
         groups = _groups(record)
         for chosen, states in groups:
             fields.values[chosen] = fields.of(chosen).closed(mean_reference, states).values
@@ -158,10 +166,11 @@ def retrieve_fields(
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
-    reference = _retrieve(record.references, method, fibrelets, progress, "reference", drift)
+    run = _Run(method, fibrelets, progress, drift, folder)
+    reference = run.amplitudes(record.references, "reference")
     mean_reference = _mean_reference(reference)
-    fields = _retrieve(record.images, method, fibrelets, progress, "sample", drift).in_phase_with(mean_reference)
-    blank = _retrieve(record.blank, method, fibrelets, progress, "blank", drift).in_phase_with(mean_reference)
+    fields = run.amplitudes(record.images, "sample").in_phase_with(mean_reference)
+    blank = run.amplitudes(record.blank, "blank").in_phase_with(mean_reference)
     fields, blank = (part.closed(mean_reference, record.illumination) for part in (fields, blank))
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
     noise = noise_scale(np.concatenate(errors, axis=1))
@@ -190,23 +199,49 @@ def fibrelets_of(calibration: Calibration) -> Fibrelets:
     return locate_fibrelets(total, images.pixel_size)
 
 
-def _retrieve(
-    images: Images,
-    method: RetrievalMethod,
-    fibrelets: Fibrelets,
-    progress: bool,
-    name: str,
-    drift: Drift | None = None,
-    batch: int = 8,
-) -> _Amplitudes:
-    planes = len(images.diversity)
-    modes = mode_matrix(fibrelets, images.frame, images.pixel_size)
-    values = np.empty((images.captures, 2, len(fibrelets.centres)), complex)
-    variance = np.empty(values.shape)
-    status = np.zeros(images.captures, np.uint8)
-    bar = tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not progress)
-    for start in range(0, images.captures, batch):
-        part = range(start, min(start + batch, images.captures))
+@dataclass(frozen=True)
+class _Run:
+    """The settings of one call."""
+
+    method: RetrievalMethod
+    fibrelets: Fibrelets
+    progress: bool = False
+    drift: Drift | None = None
+    folder: str | Path | None = None
+    batch: int = 8
+
+    def amplitudes(self, images: Images, name: str) -> _Amplitudes:
+        """Of all captures, with the drift taken out; those that are in the folder are not retrieved again."""
+        basis = ModeBasis(mode_matrix(self.fibrelets, images.frame, images.pixel_size))
+        kept = None if self.folder is None else self._kept(images, name)
+        done = []
+        with tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not self.progress) as bar:
+            for start in range(0, images.captures, self.batch):
+                part = range(start, min(start + self.batch, images.captures))
+                found = None if kept is None else kept.read(f"capture_{start:06d}")
+                if found is None:
+                    found = self._batch(images, part, basis)
+                    if kept is not None:
+                        kept.write(f"capture_{start:06d}", found)
+                done.append(found)
+                bar.update(len(part))
+        whole = _Amplitudes(*(np.concatenate([getattr(d, f) for d in done]) for f in ("values", "variance", "status")))
+        if self.drift is None:
+            return whole
+        values = self.drift.correct(whole.values, images.times, self.fibrelets)
+        spread = self.drift.phase_variance(images.times, self.fibrelets)[:, None]
+        return replace(whole, values=values, variance=whole.variance + np.abs(values) ** 2 * spread)
+
+    def _kept(self, images: Images, name: str) -> Kept:
+        ends = tuple(np.asarray(images.radiance[c]) for c in (0, images.captures - 1))
+        shape = (images.captures, images.frame, images.wavelength, images.pixel_size)
+        settings = (images.diversity, images.steps, images.times)
+        call = fingerprint(shape, settings, ends, self.method, self.fibrelets, self.batch)
+        return Kept(Path(self.folder or "") / name, call, (_Amplitudes,), "record, method or set of fibrelets")
+
+    def _batch(self, images: Images, part: range, basis: ModeBasis) -> _Amplitudes:
+        """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones."""
+        planes = len(images.diversity)
         # all of one capture before the next: a lazy stack makes its three parts together
         read = [(images.radiance[c], images.variance[c], images.saturated[c]) for c in part]
         radiance, noise, saturated = (np.stack([np.asarray(r[i]) for r in read]) for i in range(3))
@@ -214,28 +249,24 @@ def _retrieve(
         diversity = Defocus(
             radiance[:, :planes], images.diversity, images.wavelength, images.pixel_size, noise[:, :planes]
         )
-        retrieved = retrieve(diversity, method, batch=batch)
-        status[part.start : part.stop] = retrieved.status
+        retrieved = retrieve(diversity, self.method, batch=self.batch)
         fringes = relative_phase(radiance[:, planes:], images.steps, 1 / noise[:, planes:])
-        for i, capture in enumerate(part):
+        values = np.empty((len(part), 2, len(self.fibrelets.centres)), complex)
+        variance = np.empty(values.shape)
+        for i in range(len(part)):
             h, h_variance = retrieved.field[i].astype(complex), retrieved.variance[i].astype(float)
-            power = float((np.abs(h) ** 2).sum())
-            values[capture, 0], variance[capture, 0] = mode_amplitudes(h, h_variance, modes, power)
             intensity = np.abs(h) ** 2
+            power = float(intensity.sum())
+            values[i, 0], variance[i, 0] = basis.amplitudes(h, h_variance, power)
             with np.errstate(divide="ignore", invalid="ignore"):
                 v = fringes.product[i] / np.conj(h)
                 v_variance = fringes.variance[i] / intensity
             v_variance = np.where(np.isfinite(v) & np.isfinite(v_variance), v_variance, np.inf)
-            values[capture, 1], variance[capture, 1] = mode_amplitudes(v, v_variance, modes, power)
+            values[i, 1], variance[i, 1] = basis.amplitudes(v, v_variance, power)
             # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
-            ratio = np.abs(values[capture, 1]) ** 2 / (np.abs(values[capture, 0]) ** 2 + variance[capture, 0])
-            variance[capture, 1] += ratio * variance[capture, 0]
-            bar.update()
-    bar.close()
-    if drift is not None:
-        values = drift.correct(values, images.times, fibrelets)
-        variance += np.abs(values) ** 2 * drift.phase_variance(images.times, fibrelets)[:, None]
-    return _Amplitudes(values, variance, status)
+            ratio = np.abs(values[i, 1]) ** 2 / (np.abs(values[i, 0]) ** 2 + variance[i, 0])
+            variance[i, 1] += ratio * variance[i, 0]
+        return _Amplitudes(values, variance, retrieved.status)
 
 
 def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ def spot_amplitudes(modulator: Modulator, field: Any, points: Any) -> np.ndarray
     >>> np.round(np.abs(spot_amplitudes(modulator, blazed, [[0.0, 1e-3], [0.0, 0.0]])) ** 2, 2).tolist()
     [1.0, 0.0]
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
+    _checked(modulator)
     field = complex_array("field", field, shape=modulator.shape, finite=True)
     rows, columns = modulator.waves(real_array("points", points, shape=(None, 2), finite=True))
     return np.asarray(np.einsum("sy,sy->s", rows.conj(), (field @ columns.conj().T).T) / np.abs(field).sum())
@@ -124,7 +124,7 @@ def spot_array(
     >>> found.uniformity > 0.99, found.efficiency > 0.8
     (True, True)
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
+    _checked(modulator)
     points = real_array("points", points, shape=(None, 2), finite=True)
     if len(points) == 0 or np.abs(points).max() > modulator.reach:
         raise ValueError(f"points must be at least one, and within the modulator's reach of {modulator.reach:g} m.")
@@ -160,10 +160,8 @@ def fresnel_lens(modulator: Modulator, focal_length: float, centre: tuple[float,
     >>> bool(np.isclose(lens[0, 0] - lens[0, 32], -np.pi * (315e-6**2 - 5e-6**2) / (850e-9 * 0.05)))
     True
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
     focal_length = real_number("focal_length", focal_length)
-    middle = real_array("centre", centre, shape=(2,), finite=True)
-    rows, columns = (axis - c for axis, c in zip(modulator.axes(), middle, strict=True))
+    rows, columns = _around(modulator, centre)
     furthest = max(np.abs(rows).max(), np.abs(columns).max())
     if focal_length == 0 or 2 * furthest * modulator.pixel_size > modulator.wavelength * abs(focal_length):
         least = 2 * furthest * modulator.pixel_size / modulator.wavelength
@@ -192,7 +190,7 @@ def superpose(
     >>> round(float(abs(amplitude) ** 2), 4), round(float(abs(np.angle(amplitude))), 4)
     (0.1, 0.0)
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
+    _checked(modulator)
     phase = real_array("phase", phase, shape=modulator.shape, finite=True)
     point = real_array("reference", reference, shape=(2,), finite=True)[None]
     share = real_number("share", share, above=0, high=0.99)
@@ -220,10 +218,8 @@ def gaussian(modulator: Modulator, radius: float, centre: tuple[float, float] = 
     >>> round(float(gaussian(Modulator((65, 65), 10e-6, 850e-9, 0.1), 320e-6)[32, 0]), 4)       # 1 / e
     0.3679
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
     radius = real_number("radius", radius, above=0)
-    middle = real_array("centre", centre, shape=(2,), finite=True)
-    rows, columns = (axis - c for axis, c in zip(modulator.axes(), middle, strict=True))
+    rows, columns = _around(modulator, centre)
     return np.asarray(np.exp(-(rows[:, None] ** 2 + columns**2) / radius**2))
 
 
@@ -233,10 +229,8 @@ def aperture(modulator: Modulator, radius: float, centre: tuple[float, float] = 
     >>> int(aperture(Modulator((65, 65), 10e-6, 850e-9, 0.1), 25e-6).sum())
     21
     """
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
     radius = real_number("radius", radius, above=0)
-    middle = real_array("centre", centre, shape=(2,), finite=True)
-    rows, columns = (axis - c for axis, c in zip(modulator.axes(), middle, strict=True))
+    rows, columns = _around(modulator, centre)
     return np.where(rows[:, None] ** 2 + columns**2 <= radius**2, 1.0, 0.0)
 
 
@@ -271,7 +265,7 @@ def logo(modulator: Modulator, text: str, height: float, spacing: float) -> np.n
     from matplotlib.path import Path  # slow to import
     from matplotlib.textpath import TextPath
 
-    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
+    _checked(modulator)
     one_of_types("text", text, (str,), "pass the letters.")
     height, spacing = real_number("height", height, above=0), real_number("spacing", spacing, above=0)
     if not text.strip():
@@ -298,3 +292,15 @@ def _light(modulator: Modulator, illumination: Any) -> np.ndarray:
     if not light.sum() > 0:
         raise ValueError("illumination is dark everywhere; pass the amplitude on the modulator.")
     return np.asarray(light)
+
+
+def _checked(modulator: Modulator) -> None:
+    one_of_types("modulator", modulator, (Modulator,), "pass Modulator(shape, pixel_size, wavelength, focal_length).")
+
+
+def _around(modulator: Modulator, centre: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (y,) and columns (x,) of the pixels, metres from ``centre``."""
+    _checked(modulator)
+    rows, columns = modulator.axes()
+    row, column = real_array("centre", centre, shape=(2,), finite=True)
+    return rows - row, columns - column

@@ -15,6 +15,8 @@ from polinfer.checks import real_array
 
 __all__ = ["relative_phase"]
 
+ROWS = 1 << 14  # pixels worked on at a time
+
 
 def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference:
     r"""conj(H) V in every pixel by weighted least squares over k >= 3 phase steps.
@@ -54,30 +56,37 @@ def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference
         known = real_array("weights", weights, low=0, finite=True)
         if known.shape != images.shape:
             raise ValueError(f"weights must have the shape of images {images.shape}, got {known.shape}.")
-    stacked, weight = np.moveaxis(images, -3, -1), np.moveaxis(known, -3, -1)
     pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    normal = weight @ np.stack([design[:, i] * design[:, j] for i, j in pairs], axis=1)
-    right = (weight * stacked) @ design
-    inverse, solvable = _inverse(normal)
-    solution = np.einsum("...ij,...j->...i", inverse, right)
-    scale: Any = 1.0
+    both = np.stack([design[:, i] * design[:, j] for i, j in pairs])
+    *lead, _, height, width = images.shape
+    parts: list[list[np.ndarray]] = []
+    # rows that stay in the processor's cache, one after the other
+    rows = max(1, ROWS // (width * max(1, int(np.prod(lead)))))
+    for start in range(0, height, rows):
+        own = (..., slice(None), slice(start, start + rows), slice(None))
+        parts.append(_solved(images[own], known[own], design, both))
+    product, variance, mean, left = (np.concatenate(part, axis=-2) for part in zip(*parts, strict=True))
     if weights is None:
-        left = ((stacked - solution @ design.T) ** 2).sum(-1)
-        scale = left.mean() / (count - 3) if count > 3 else np.nan
-    variance = scale * (inverse[..., 1, 1] + inverse[..., 2, 2])
-    product = np.where(solvable, solution[..., 1] + 1j * solution[..., 2], np.nan)
-    return Interference(product, np.where(solvable, variance, np.inf), np.where(solvable, solution[..., 0], np.nan))
+        variance = variance * (left.mean() / (count - 3) if count > 3 else np.nan)
+    solvable = np.isfinite(mean)
+    return Interference(product, np.where(solvable, variance, np.inf), mean)
 
 
-def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverses (..., 3, 3) of symmetric matrices given by their upper triangle (..., 6), and which exist.
+def _solved(images: np.ndarray, weight: np.ndarray, design: np.ndarray, both: np.ndarray) -> list[np.ndarray]:
+    """conj(H) V, its variance for these weights, the mean and the squares left over, of (..., k, y, x).
 
-    By cofactors on whole images: a library call on a million 3 x 3 matrices takes ten times as long.
+    The normal matrices are inverted by cofactors on whole images: a library call on a million 3 x 3 matrices takes ten
+    times as long. NaN where there is no inverse.
     """
-    a, b, c, d, e, f = np.moveaxis(normal, -1, 0)
-    cofactors = [d * f - e**2, c * e - b * f, b * e - c * d, a * f - c**2, b * c - a * e, a * d - b**2]
-    determinant = a * cofactors[0] + b * cofactors[1] + c * cofactors[2]
+    weighted = weight * images
+    a, b, c, d, e, f = (sum(w * weight[..., j, :, :] for j, w in enumerate(row)) for row in both)
+    first, second, third = (sum(w * weighted[..., j, :, :] for j, w in enumerate(row)) for row in design.T)
+    ca, cb, cc, cd, ce, cf = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * ca + b * cb + c * cc
     solvable = determinant > 1e-9 * (np.maximum(a + d + f, 1e-300) / 3) ** 3
-    safe = np.where(solvable, determinant, 1.0)
-    whole = [cofactors[i] / safe for i in (0, 1, 2, 1, 3, 4, 2, 4, 5)]
-    return np.stack(whole, axis=-1).reshape(*normal.shape[:-1], 3, 3), solvable
+    over = np.where(solvable, 1 / np.where(solvable, determinant, 1.0), np.nan)
+    mean = over * (ca * first + cb * second + cc * third)
+    real = over * (cb * first + cd * second + ce * third)
+    imaginary = over * (cc * first + ce * second + cf * third)
+    left = sum((images[..., j, :, :] - mean - p * real - q * imaginary) ** 2 for j, (_, p, q) in enumerate(design))
+    return [real + 1j * imaginary, over * (cd + cf), mean, np.asarray(left)]

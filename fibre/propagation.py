@@ -14,7 +14,7 @@ import numpy as np
 
 from polinfer.checks import complex_array, real_array, real_number
 
-__all__ = ["angular_spectrum", "transfer_function"]
+__all__ = ["angular_spectrum", "phase_per_metre", "transfer_function"]
 
 
 def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, pixel_size: float) -> np.ndarray:
@@ -45,18 +45,30 @@ def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, 
     return values.reshape(*distance.shape, *shape)
 
 
+def phase_per_metre(shape: tuple[int, int], wavelength: float, pixel_size: float) -> tuple[np.ndarray, np.ndarray]:
+    r"""Phase that every frequency gains in a metre of free space, piston left out, and which frequencies propagate.
+
+    :math:`2\pi (\sqrt{1/\lambda^2 - |f|^2} - 1/\lambda)`, radians a metre, (y, x) as :func:`numpy.fft.fftfreq` orders
+    them; that of the grazing wave where none propagates.
+
+    >>> turn, propagates = phase_per_metre((4, 4), 850e-9, 1e-6)
+    >>> float(turn[0, 0]), bool(propagates.all())
+    (0.0, True)
+    """
+    fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
+    squared = 1 / wavelength**2 - fy[:, None] ** 2 - fx**2
+    return 2 * np.pi * (np.sqrt(np.maximum(squared, 0)) - 1 / wavelength), squared > 0
+
+
 @lru_cache(maxsize=4)
 def _transfer(shape: tuple[int, int], distances: bytes, wavelength: float, pixel_size: float) -> np.ndarray:
     """The masks of :func:`transfer_function`, kept: a run asks for the same ones at every capture."""
     distance = np.frombuffer(distances)[:, None, None]
     fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
-    squared = 1 / wavelength**2 - fy[:, None] ** 2 - fx[None, :] ** 2
-    propagating = squared > 0
-    axial = np.sqrt(np.where(propagating, squared, 1.0))
-    phase = 2 * np.pi * distance * (axial - 1 / wavelength)
-    inside = propagating
+    turn, inside = phase_per_metre(shape, wavelength, pixel_size)
+    phase, axial = distance * turn, turn / (2 * np.pi) + 1 / wavelength
     for f, n in ((fy[:, None], shape[0]), (fx[None, :], shape[1])):
-        inside = inside & (np.abs(distance * f / axial) <= n * pixel_size / 2)
+        inside = inside & (np.abs(distance * f) <= axial * n * pixel_size / 2)
     masks = np.where(inside, np.exp(1j * phase), 0.0)
     masks.flags.writeable = False
     return masks

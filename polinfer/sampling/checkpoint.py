@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-__all__ = ["Checkpoint", "Earlier", "fingerprint"]
+__all__ = ["Checkpoint", "Earlier"]
 
 EVERY = 5.0  # seconds between two writes
 
@@ -25,24 +23,6 @@ class Earlier(NamedTuple):
     now: np.ndarray
     now_values: np.ndarray
     random_state: tuple[str, np.ndarray, int, int, float]
-
-
-def fingerprint(*parts: Any) -> str:
-    """A hash of declarations, numbers and trees of arrays: of all that the random walk depends on.
-
-    >>> fingerprint(1, np.zeros(2)) == fingerprint(1, np.zeros(2)), fingerprint(1) == fingerprint(2)
-    (True, False)
-    """
-    digest = hashlib.sha256()
-    for part in parts:
-        leaves = jax.tree.leaves(part)
-        if leaves and all(isinstance(leaf, np.ndarray | np.generic) for leaf in leaves):
-            for leaf in leaves:
-                digest.update(f"{leaf.dtype}{leaf.shape}".encode() + np.ascontiguousarray(leaf).tobytes())
-        else:
-            digest.update(repr(part).encode())
-        digest.update(b";")
-    return digest.hexdigest()
 
 
 class Checkpoint:

@@ -20,13 +20,14 @@ import numpy as np
 from ..checks import integer, one_of_types
 from ..fitting.frames import fit
 from ..fitting.generic import Prepared, prepare
+from ..kept import fingerprint
 from ..model import Model, as_device
 from ..noise import InferredNoise
 from ..records import Fit, Measurement, Parameters
 from ..statistics import Statistics
 from .bridge import DEFENCE, Bridge, Proposal, autocorrelation_time, defended, fit_mixture, halves_bridged
 from .charts import Target, centre_of, periods
-from .checkpoint import Checkpoint, fingerprint
+from .checkpoint import Checkpoint
 from .nuisances import draw_nuisances
 from .raw import Raw
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import storage
 from ..checks import one_of_types, real_number
+from ..kept import Kept, fingerprint
 from ..model import Model
 from ..noise import InferredNoise
 from ..records import Measurement, Parameters
-from .checkpoint import fingerprint
 from .ensemble import Ensemble
 from .gibbs import Gibbs
 from .summaries import Summary, summarise_draws
@@ -22,7 +21,6 @@ __all__ = ["summarise"]
 
 VALUES = 1 << 24  # draws of all parameters in memory at once
 LEAST = 512  # pixels of a part
-NAME = "settings.txt"
 
 
 def summarise(
@@ -82,8 +80,8 @@ def summarise(
     pixels = int(np.prod(measurement.shape))
     size = max(VALUES // (len(Parameters._fields) * call.chains * call.draws) // LEAST, 1) * LEAST
     begins = range(0, pixels, size)
-    kept = None if folder is None else _Kept(Path(folder), call, level)
-    done = [None if kept is None else kept.read(number) for number in range(len(begins))]
+    kept = None if folder is None else _kept(folder, call, level)
+    done = [None if kept is None else kept.read(_part(number)) for number in range(len(begins))]
     todo = [number for number, part in enumerate(done) if part is None]
     # places within good of the pixels of each part that is still to be drawn
     places = [np.arange(*np.searchsorted(call.good, (begins[n], min(begins[n] + size, pixels)))) for n in todo]
@@ -99,45 +97,18 @@ def summarise(
         part = summarise_draws(model, Parameters(**parameters), gain, sigma, status, level)
         done[number] = part
         if kept is not None:
-            kept.write(number, part)
+            kept.write(_part(number), part)
     return Summary.join([part for part in done if part is not None], measurement.shape)
 
 
-class _Kept:
-    """Summaries of parts in a folder, which belongs to one call."""
+def _part(number: int) -> str:
+    return f"part_{number:06d}"
 
-    def __init__(self, folder: Path, call: Call, level: float) -> None:
-        self.folder = folder
-        data = call.measurement
-        arrays = (data.illumination, data.response, data.sigma, data.weight, data.mask)
-        settings = (call.model, call.sampler, call.chains, call.draws, call.seed, level, [x is None for x in arrays])
-        name = fingerprint(settings, tuple(np.asarray(x) for x in arrays if x is not None))
-        file = folder / NAME
-        if file.exists():
-            if file.read_text().strip() != name:
-                raise ValueError(
-                    f"folder: {folder} belongs to another model, measurement, seed or setting; choose another one, or "
-                    "remove it to start anew."
-                )
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise ValueError(f"folder: {folder} holds other files; choose an empty one.")
-        file.write_text(name + "\n")
 
-    def _path(self, number: int) -> Path:
-        return self.folder / f"part_{number:06d}.nc"
-
-    def read(self, number: int) -> Summary | None:
-        """A part that is finished, None: not yet."""
-        path = self._path(number)
-        if not path.exists():
-            return None
-        found = storage.load(path, (Summary, Parameters))
-        if not isinstance(found, Summary):
-            raise ValueError(f"folder: {path} holds no Summary; remove it to draw this part anew.")
-        return found
-
-    def write(self, number: int, part: Summary) -> None:
-        """Keep a finished part."""
-        storage.save(part, self._path(number))
+def _kept(folder: str | Path, call: Call, level: float) -> Kept:
+    """The folder of this call."""
+    data = call.measurement
+    arrays = (data.illumination, data.response, data.sigma, data.weight, data.mask)
+    settings = (call.model, call.sampler, call.chains, call.draws, call.seed, level, [x is None for x in arrays])
+    name = fingerprint(settings, tuple(np.asarray(x) for x in arrays if x is not None))
+    return Kept(folder, name, (Summary, Parameters), "model, measurement, seed or setting")

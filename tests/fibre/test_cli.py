@@ -42,6 +42,29 @@ def test_frames_become_jones_data_by_four_commands(bench, tmp_path):
     np.testing.assert_allclose(load(measurement).sigma, expected.sigma, rtol=1e-9)
 
 
+@pytest.mark.parametrize("method", ["modal", "accelerated"])
+def test_other_methods_of_retrieval_see_the_same_fields(bench, tmp_path, method):
+    """From 8-bit frames of the bench, through fibrelets that were found in them."""
+    calibration, out = save(bench.calibration, tmp_path / "calibration.nc"), tmp_path / "fields.nc"
+    known = save(bench.calibration_fields, tmp_path / "known.nc")
+    kept = tmp_path / "kept"
+    arguments = ("retrieve", calibration, out, "--method", method, "--fibrelets", known, "--resume", kept)
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    found, usual = load(out), bench.calibration_fields
+    assert not found.status.any()
+    for one, other in zip(found.fields, usual.fields, strict=True):  # modulo the piston of the reference spot
+        turned = one * np.exp(1j * np.angle(np.vdot(one, other)))
+        assert np.linalg.norm(turned - other) < 0.03 * np.linalg.norm(other)
+    # all captures are in the folder: the second time none is retrieved
+    again = run(*arguments, "--overwrite")
+    assert again.exit_code == 0, again.output
+    np.testing.assert_array_equal(load(out).fields, found.fields)
+    other = run("retrieve", calibration, out, "--fibrelets", known, "--resume", kept, "--overwrite")
+    assert other.exit_code == 2
+    assert "belongs to another record, method" in other.output
+
+
 @pytest.mark.parametrize("command", ["retrieve", "recover", "reconstruct"])
 def test_every_command_has_help_with_an_example(command):
     result = run(command, "--help")

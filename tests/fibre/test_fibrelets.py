@@ -9,7 +9,7 @@ import scipy.spatial
 import skimage.io
 
 from fibre import Bundle, Fibrelets, find_fibrelets
-from fibre.fibrelets import locate_fibrelets, mode_amplitudes, mode_matrix
+from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix
 from polinfer import datasets
 
 PIXEL, SHAPE = 0.5e-6, (140, 150)
@@ -240,7 +240,7 @@ def test_amplitudes_are_dense_weighted_least_squares():
     variance[10:14, 12:20] = np.inf
     field[11, 13] = np.nan  # where it says nothing it may be anything
     prior = 3.0
-    found, stated = mode_amplitudes(field, variance, modes, prior)
+    found, stated = ModeBasis(modes).amplitudes(field, variance, prior)
     g = modes.toarray()
     usable = np.isfinite(variance.ravel())
     weight = 1 / variance.ravel()[usable]
@@ -248,17 +248,22 @@ def test_amplitudes_are_dense_weighted_least_squares():
     right = np.concatenate([field.ravel()[usable] * np.sqrt(weight), np.zeros(5)])
     np.testing.assert_allclose(found, np.linalg.lstsq(rows + 0j, right, rcond=None)[0], rtol=1e-9)
     np.testing.assert_allclose(stated, np.diag(np.linalg.inv(rows.T @ rows)), rtol=0.01)
+    # one variance for the whole frame takes another way
+    alike, _ = ModeBasis(modes).amplitudes(np.nan_to_num(field), np.full((30, 32), 0.7), prior)
+    expected = np.linalg.solve(g.T @ g / 0.7 + np.eye(5) / prior, g.T @ np.nan_to_num(field).ravel() / 0.7)
+    np.testing.assert_allclose(alike, expected, rtol=1e-9)
 
 
 def test_the_stated_variance_is_the_mean_squared_error():
     modes, generator = small(), np.random.default_rng(4)
+    basis = ModeBasis(modes)
     truth = generator.normal(size=5) + 1j * generator.normal(size=5)
     clean = (modes @ truth).reshape(30, 32)
     variance = generator.uniform(0.01, 0.05, (30, 32))
     errors = []
     for _ in range(600):
         noise = generator.normal(size=(2, 30, 32)) * np.sqrt(variance / 2)
-        found, stated = mode_amplitudes(clean + noise[0] + 1j * noise[1], variance, modes, 1e6)
+        found, stated = basis.amplitudes(clean + noise[0] + 1j * noise[1], variance, 1e6)
         errors.append(np.abs(found - truth) ** 2 / stated)
     # exponential variables: standard deviation 1 each
     assert np.mean(errors) == pytest.approx(1, abs=4 / np.sqrt(600 * 5) + 0.01)
@@ -266,7 +271,6 @@ def test_the_stated_variance_is_the_mean_squared_error():
 
 
 def test_without_light_the_prior_is_all_there_is():
-    modes = small()
-    found, stated = mode_amplitudes(np.ones((30, 32)), np.full((30, 32), np.inf), modes, 2.5)
+    found, stated = ModeBasis(small()).amplitudes(np.ones((30, 32)), np.full((30, 32), np.inf), 2.5)
     assert np.all(found == 0)
     np.testing.assert_allclose(stated, 2.5)

@@ -115,6 +115,36 @@ def test_a_known_tilt_is_taken_out_of_every_capture(bench):
     assert np.linalg.norm(tilted.blank - usual.blank) > 0.1 * np.linalg.norm(usual.blank)
 
 
+class Stopping(RetrievalMethod):
+    """A method that is interrupted at its third batch, until it is told to go on."""
+
+    def __init__(self, inner):
+        self.inner, self.batches, self.most = inner, 0, 2
+
+    def __repr__(self):
+        return "the same method"
+
+    def solve(self, stack):
+        if self.batches == self.most:
+            raise KeyboardInterrupt
+        self.batches += 1
+        return self.inner.solve(stack)
+
+
+def test_an_interrupted_retrieval_goes_on_where_it_was(bench, tmp_path):
+    method, fibrelets = Stopping(METHOD), bench.calibration_fields.fibrelets
+    with pytest.raises(KeyboardInterrupt):
+        retrieve_fields(bench.calibration, method, fibrelets, folder=tmp_path / "kept")
+    method.most = 1000
+    found = retrieve_fields(bench.calibration, method, fibrelets, folder=tmp_path / "kept")
+    captures = bench.calibration.images.captures + bench.calibration.references.captures
+    assert method.batches <= -(-captures // 8) + 1  # none twice; references are a batch of their own
+    np.testing.assert_array_equal(found.fields, bench.calibration_fields.fields)
+    np.testing.assert_array_equal(found.variance, bench.calibration_fields.variance)
+    with pytest.raises(ValueError, match="belongs to another record"):
+        retrieve_fields(bench.calibration, METHOD, fibrelets, folder=tmp_path / "kept")
+
+
 def test_jones_matrices_from_frames_are_the_samples(bench):
     measurement = reconstruct(recover(bench.calibration_fields, Ridge()), bench.recording_fields)
     found = measurement.response @ np.linalg.pinv(measurement.illumination)

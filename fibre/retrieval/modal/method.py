@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy.fft
 import scipy.sparse.linalg
 import scipy.spatial
 
+from fibre.propagation import phase_per_metre
 from fibre.records import Fibrelets
 from fibre.retrieval.base import RetrievalMethod, Solution, Stack, judged, measured_amplitudes
 from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
@@ -91,14 +95,23 @@ class Modal(RetrievalMethod):
     def solve(self, stack: Stack) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
         geometry = _geometry(self, stack)
-        coarse = [_coarse(stack, k, geometry.views.step) for k in range(len(stack.intensities))]
-        found = [self._found(stack, k, geometry, *one) for k, one in enumerate(coarse)]
-        field = np.stack([geometry.camera.focus(one.amplitudes) for one in found])
-        converged = np.array([one.step <= max(self.tolerance, 2e-2) for one in found])
-        misfitted = None
-        if stack.variance is not None:
-            misfitted = np.array([_misfits(one, geometry, *own) for one, own in zip(found, coarse, strict=True)])
-        return Solution(field, converged, np.array([one.steps for one in found]), misfitted=misfitted)
+        count, cores = len(stack.intensities), os.cpu_count() or 1
+
+        def one(k: int) -> tuple[Found, bool]:
+            with scipy.fft.set_workers(max(1, cores // count)):
+                images, spread = _coarse(stack, k, geometry.views.step)
+                found = self._found(stack, k, geometry, images, spread)
+                misfitted = stack.variance is not None and _misfits(found, geometry, images, spread)
+            return found, misfitted
+
+        # a field to a thread: nearly all is inside FFTs and sparse products, which let other threads run
+        with ThreadPoolExecutor(min(count, cores)) as pool:
+            found, misfitted = zip(*pool.map(one, range(count)), strict=True)
+        field = np.stack([geometry.camera.focus(each.amplitudes) for each in found])
+        converged = np.array([each.step <= max(self.tolerance, 2e-2) for each in found])
+        steps = np.array([each.steps for each in found])
+        known = None if stack.variance is None else np.array(misfitted)
+        return Solution(field, converged, steps, misfitted=known)
 
     def _found(self, stack: Stack, k: int, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> Found:
         """Amplitudes of field ``k``, and what was found of the bench, from images and variances of the coarse grid.
@@ -178,11 +191,9 @@ def _made(key: _Key) -> Geometry:
     fields, radii = spreads(fibrelets, masks, pixel)
     tree = scipy.spatial.cKDTree(fibrelets.centres)
     gram = scipy.sparse.linalg.splu((camera.transposed @ camera.modes).tocsc().astype(float))
-    fy, fx = (np.fft.fftfreq(n, views.pixel_size) for n in views.masks.shape[-2:])
-    squared = np.maximum(1 / wavelength**2 - fy[:, None] ** 2 - fx**2, 0)
-    turn = (2 * np.pi * (np.sqrt(squared) - 1 / wavelength)).astype(np.float32)
+    turn, _ = phase_per_metre(views.masks.shape[-2:], wavelength, views.pixel_size)
     return Geometry(views, camera, make_coupling(tree, views, radii),
-                    make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn)  # fmt: skip
+                    make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn.astype(np.float32))  # fmt: skip
 
 
 def _misfits(found: Found, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> bool:

@@ -190,13 +190,19 @@ def refine(
             if trial.cost < state.cost:
                 break
         else:
-            return replace(found, step=0.0, steps=count)
-        size = shrink * float(np.linalg.norm(change)) / max(float(np.linalg.norm(moved.amplitudes)), 1e-300)
+            # no way down: at the minimum if even the smallest step was a small one
+            return replace(found, step=_size(shrink * change, found), steps=count)
+        size = _size(shrink * change, moved)
         gained = 1 - trial.cost / state.cost
         state, found = trial, replace(moved, cost=trial.cost, step=size, steps=count)
         if size < tolerance or gained < 1e-3:
             break
     return found
+
+
+def _size(change: np.ndarray, at: Found) -> float:
+    """Of a change of the amplitudes, relative to them."""
+    return float(np.linalg.norm(change)) / max(float(np.linalg.norm(at.amplitudes)), 1e-300)
 
 
 def _step(state: _State, precondition: _Preconditioner, inner: int) -> tuple[np.ndarray, np.ndarray | None]:

@@ -40,18 +40,18 @@ class Views:
 
     def spectrum(self, amplitudes: np.ndarray) -> np.ndarray:
         """Spectrum of the field in focus, complex64 (y, x)."""
-        return scipy.fft.fft2(self.focus(amplitudes), workers=-1)
+        return scipy.fft.fft2(self.focus(amplitudes))
 
     def fields(self, spectrum: np.ndarray) -> np.ndarray:
         """Fields of all images, complex64 (image, y, x), from a spectrum."""
-        return scipy.fft.ifft2(spectrum * self.masks, workers=-1, overwrite_x=True)
+        return scipy.fft.ifft2(spectrum * self.masks, overwrite_x=True)
 
     def adjoint(self, fields: np.ndarray) -> np.ndarray:
         """The adjoint of both together: complex128 (m,)."""
         # conj of the sum of conj(F) M: vecdot conjugates as it goes, no second copy of all images
-        spectra: Any = scipy.fft.fft2(fields, workers=-1, overwrite_x=True)
+        spectra: Any = scipy.fft.fft2(fields, overwrite_x=True)
         spectrum = np.vecdot(np.moveaxis(spectra, 0, -1), np.moveaxis(self.masks, 0, -1)).conj()
-        back = scipy.fft.ifft2(spectrum, workers=-1, overwrite_x=True).reshape(-1, 1)
+        back = scipy.fft.ifft2(spectrum, overwrite_x=True).reshape(-1, 1)
         parts = self.transposed @ back.view(np.float32)
         return parts[:, 0].astype(float) + 1j * parts[:, 1]
 
@@ -87,7 +87,7 @@ def coarse_images(images: np.ndarray, step: int) -> np.ndarray:
         return images
     shape = images.shape[-2:]
     rows, columns = (_low(s, s // step) for s in shape)
-    spectrum = scipy.fft.rfft2(images, workers=-1)
+    spectrum = scipy.fft.rfft2(images)
     # the middle of a coarse pixel lies between camera pixels
     shift = [np.exp(2j * np.pi * np.fft.fftfreq(s)[low] * (step - 1) / 2).astype(np.complex64)
              for s, low in zip(shape, (rows, columns), strict=True)]  # fmt: skip
@@ -95,7 +95,7 @@ def coarse_images(images: np.ndarray, step: int) -> np.ndarray:
     half[-1] = shape[1] // step // 2  # the highest frequency, by its positive name
     low = spectrum[:, rows[:, None], half] * shift[0][:, None] * shift[1][: len(half)]
     few = tuple(s // step for s in shape)
-    return scipy.fft.irfft2(low, s=few, workers=-1).astype(np.float32) / step**2
+    return scipy.fft.irfft2(low, s=few).astype(np.float32) / step**2
 
 
 def coarse_variance(variance: np.ndarray, step: int) -> np.ndarray:
