@@ -91,15 +91,31 @@ class Diversity:
         return jax.device_put(self.masks.astype(np.complex64))
 
 
-def Defocus(intensities: Any, distances: Any, wavelength: float, pixel_size: float, variance: Any = None) -> Diversity:
-    """Diversity by defocus: image i (real (*B, m, y, x)) was taken ``distances[i]`` metres along the beam.
+def Defocus(
+    intensities: Any,
+    distances: Any,
+    wavelength: float,
+    pixel_size: float,
+    variance: Any = None,
+    numerical_aperture: float | None = None,
+) -> Diversity:
+    r"""Diversity by defocus: image i (real (*B, m, y, x)) was taken ``distances[i]`` metres along the beam.
+
+    ``numerical_aperture``: of the microscope that sees the field, at the field's side. Its pupil passes
+    :math:`|f| \le \mathrm{NA}/\lambda` only, so that all beyond is noise, and is not retrieved; None: as far as the
+    pixels reach.
 
     >>> Defocus(np.ones((3, 8, 8)), [-1e-5, 0, 1e-5], wavelength=850e-9, pixel_size=1e-6).masks.shape
     (3, 8, 8)
     """
     intensities = real_array("intensities", intensities, trailing=(None, None, None), finite=True)
     distances = real_array("distances", distances, shape=(intensities.shape[-3],), finite=True)
-    masks = transfer_function(intensities.shape[-2:], distances, wavelength, pixel_size)
+    shape = intensities.shape[-2:]
+    masks = transfer_function(shape, distances, wavelength, pixel_size)
+    if numerical_aperture is not None:
+        highest = real_number("numerical_aperture", numerical_aperture, above=0) / wavelength
+        fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
+        masks = np.where(fy[:, None] ** 2 + fx**2 <= highest**2, masks, 0)
     return Diversity(intensities, masks, wavelength, pixel_size, variance, distances)
 
 
