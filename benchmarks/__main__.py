@@ -13,6 +13,7 @@ QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
 ALL = (
     *QUICK,
     "bundle",
+    "images",
     "peers",
     "chain",
     "parts",

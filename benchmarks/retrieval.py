@@ -17,24 +17,40 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 
 from acquisition.exposure import InverseVariance, merge_exposures
 from benchmarks.results import Results, median_seconds
-from fibre import Accelerated, Bundle, Defocus, Fibrelets, GerchbergSaxton, Modal, TransportOfIntensity, retrieve
+from fibre import (
+    Accelerated,
+    Bundle,
+    Defocus,
+    Diversity,
+    Fibrelets,
+    GerchbergSaxton,
+    Modal,
+    TransportOfIntensity,
+    retrieve,
+)
 
 PIXEL, SPAN, PLANES = 0.39e-6, 50e-6, 7
 FINER, FOCUS = 2, 1.003
 MARGIN = 10e-6  # dark, from the bundle to the frame's edge
 
 
-def scene(side: int, photons: float, seed: int = 0) -> tuple[Bundle, Fibrelets, Any, np.ndarray]:
-    """The bundle, what is known of its fibrelets, the images, and the true field (y, x) in photo-electrons' roots."""
-    bundle = Bundle.hexagonal(radius=side * PIXEL / 2 - MARGIN, rng=seed)
+def scene(
+    side: int, photons: float, seed: int = 0, planes: Any = None, span: float = SPAN, pixel: float = PIXEL
+) -> tuple[Bundle, Fibrelets, Diversity, np.ndarray]:
+    """The bundle, what is known of its fibrelets, the images, and the true field (y, x) in photo-electrons' roots.
+
+    ``planes``: distances, metres; None: seven over ``span``.
+    """
+    bundle = Bundle.hexagonal(radius=side * pixel / 2 - MARGIN, rng=seed)
     rng = np.random.default_rng(seed + 1)
     c = np.zeros((2, bundle.cores), complex)
     c[0] = rng.standard_normal(bundle.cores) + 1j * rng.standard_normal(bundle.cores)
-    distances = np.linspace(-SPAN / 2, SPAN / 2, PLANES)
-    truth, images = _truth(bundle, c, side, distances)
+    distances = np.linspace(-span / 2, span / 2, PLANES) if planes is None else np.asarray(planes)
+    truth, images = _truth(bundle, c, side, distances, pixel)
     scale = photons / images.max()
     radiance, variance = np.empty_like(images), np.empty_like(images)
     for i, image in enumerate(images * scale):
@@ -43,16 +59,18 @@ def scene(side: int, photons: float, seed: int = 0) -> tuple[Bundle, Fibrelets, 
         bundle.centres + 20e-9 * rng.standard_normal(bundle.centres.shape),
         bundle.mode_radius * (1 + 0.02 * rng.standard_normal(bundle.cores)),
     )
-    return bundle, known, Defocus(radiance, distances, bundle.wavelength, PIXEL, variance), truth * np.sqrt(scale)
+    return bundle, known, Defocus(radiance, distances, bundle.wavelength, pixel, variance), truth * np.sqrt(scale)
 
 
-def _truth(bundle: Bundle, c: np.ndarray, side: int, distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _truth(
+    bundle: Bundle, c: np.ndarray, side: int, distances: np.ndarray, pixel: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Field in focus and mean intensities of the camera's pixels, one plane after the other: frames are large."""
     images = []
     for distance in distances * FOCUS:
-        fine = np.abs(bundle.image(c, (side, side), PIXEL, distance, oversampling=FINER, padding=1)[0]) ** 2
+        fine = np.abs(bundle.image(c, (side, side), pixel, distance, oversampling=FINER, padding=1)[0]) ** 2
         images.append(fine.reshape(side, FINER, side, FINER).mean((1, 3)))
-    return bundle.image(c, (side, side), PIXEL, padding=1)[0], np.stack(images)
+    return bundle.image(c, (side, side), pixel, padding=1)[0], np.stack(images)
 
 
 def _camera(image: np.ndarray, photons: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +137,62 @@ def main(size: int | None = None, full: bool = False) -> None:
             each = (many - few) / (sweeps[1] - sweeps[0])
             results.bar("one sweep over one pair of FFTs of all planes", each / pair_seconds, 1.3)
             results.bar("transport of intensity", found["TransportOfIntensity, one step"][0], 0.04, "s")
-    results.save(results.lines("seconds", "error", "photons"))
+    _wide(results)
+    _calibration(results, side, *scene(side, 1e4)[1:])
+    results.save(_picture(results.rows))
+
+
+def _wide(results: Results) -> None:
+    """Planes so far apart that the light of tens of fibrelets meets in each."""
+    _, known, stack, truth = scene(200, 1e4, span=240e-6, pixel=0.72e-6)
+    for name, method in {"GerchbergSaxton, 20": _sweeps(20), "Modal": Modal(known)}.items():
+        first, _ = _once(stack, method)
+        spent, field = _once(stack, method)
+        results.add(planes_over=240e-6, fibrelets=len(known.centres), method=name, seconds=spent,
+                    error=error(field, truth), first_seconds=first)  # fmt: skip
+
+
+def _calibration(results: Results, side: int, known: Fibrelets, stack: Diversity, truth: np.ndarray) -> None:
+    """What the fields of a calibration of 293 captures take, from a batch of eight."""
+    few = 8
+    assert stack.variance is not None
+    assert stack.distances is not None
+    images, variance = (np.broadcast_to(a, (few, *a.shape)) for a in (stack.intensities, stack.variance))
+    many = Defocus(images, stack.distances, stack.wavelength, stack.pixel_size, variance)
+    methods: dict[str, Any] = {
+        "TransportOfIntensity, one step": TransportOfIntensity(iterations=0, order=1),
+        "Modal, start and one step": Modal(known, steps=1),
+        "Modal": Modal(known),
+    }
+    for name, method in methods.items():
+        retrieve(stack, method)
+        spent, field = _once(many, method)
+        whole = 293 * spent / few
+        results.add(captures=293, side=side, method=name, seconds=whole, error=error(field[0], truth))
+        if side == 1200 and name != "Modal":
+            results.bar(f"fields of a calibration, {name}", whole, 29.5 if "Transport" in name else 180, "s")
+
+
+def _picture(rows: list[dict[str, Any]]) -> Figure:
+    """Error against time, a colour for each method."""
+    rows = [row for row in rows if "photons" in row]
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    names = list(dict.fromkeys(row["method"].split(",")[0] for row in rows))
+    for row in rows:
+        name = row["method"].split(",")[0]
+        dim = row["photons"] == 1e4
+        axes.plot(row["seconds"], row["error"], "o" if dim else "s", color=f"C{names.index(name)}", mfc="none" if dim
+                  else None, label=f"{name}, {row['photons']:.0e} photons")  # fmt: skip
+        if "Gerchberg" in name and dim:
+            axes.annotate(row["method"].split(", ")[1], (row["seconds"], row["error"]), (4, 4),
+                          textcoords="offset points", fontsize=7)  # fmt: skip
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    axes.set(xscale="log", yscale="log", xlabel="seconds a field", ylabel="relative error of the bright pixels")
+    axes.legend(unique.values(), unique.keys(), fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    axes.grid(alpha=0.3)
+    return figure
 
 
 def _sweeps(count: int) -> GerchbergSaxton:

@@ -27,6 +27,7 @@ from .records import (
 )
 from .recovery.base import recover
 from .recovery.ridge import Ridge
+from .registration import Registration, register_facets
 from .retrieval.accelerated import Accelerated
 from .retrieval.base import retrieve
 from .retrieval.gerchberg_saxton import GerchbergSaxton
@@ -51,6 +52,7 @@ __all__ = [
     "Modal",
     "Recording",
     "RecordingFields",
+    "Registration",
     "RetrievalStatus",
     "Retrieved",
     "Ridge",
@@ -62,6 +64,7 @@ __all__ = [
     "load",
     "reconstruct",
     "recover",
+    "register_facets",
     "relative_phase",
     "retrieve",
     "retrieve_fields",

@@ -19,6 +19,7 @@ from fibre.records import (
     RecordingFields,
     Retrieved,
 )
+from fibre.registration import Registration
 from polinfer import storage
 from polinfer.files import TYPES as BELOW
 
@@ -36,6 +37,7 @@ TYPES: tuple[type, ...] = (
     Inverse,
     Recording,
     RecordingFields,
+    Registration,
     Retrieved,
 )
 

@@ -50,6 +50,7 @@ def records(standard):
         Recording(images(3), np.ones((2, 3)), images(3), images(1)),
         Defocus(np.ones((2, 3, 8, 8)), [0, 1e-5, 2e-5], 8e-7, 1e-6, variance=np.full((2, 3, 8, 8), np.inf)),
         Fibrelets(np.arange(6.0).reshape(3, 2), 1.6e-6),
+        fibre.Registration(np.eye(2, 3), np.arange(6).reshape(3, 2), np.ones((3, 2)), 2.5),
         fibre.Drift(np.arange(2.0), np.ones(2), np.ones((2, 2)), np.ones((2, 3, 3)), np.ones(2), np.zeros(2)),
         images(),
         fibre.Interference(complex_stack(3, 4), np.full((3, 4), np.inf), np.ones((3, 4))),

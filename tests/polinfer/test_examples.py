@@ -66,3 +66,15 @@ def test_microlenses(tmp_path):
     assert len(lengths) == 6
     assert max(lengths) < 1.04 * min(lengths)  # one array, one focal length
     assert (tmp_path / "microlens.png").stat().st_size > 10_000
+
+
+def test_defocus_stack(tmp_path):
+    folder = fibre_folder()
+    if not (folder / "dhm_defocus_stack").is_dir() and os.environ.get("POLINFER_REQUIRE_DATA") != "1":
+        pytest.skip(f"measured data are not here: {folder} has no dhm_defocus_stack")
+    said = run("09_defocus_stack.py", tmp_path, quick_to_compile=False)
+    scores = [float(part.split()[0]) for part in said.strip().splitlines()[-2].split("um:")[1:]]
+    # images never used, against what 100 sweeps of Gerchberg-Saxton of an independent program predict
+    assert len(scores) == 4
+    assert all(score > bar for score, bar in zip(scores, (0.462, 0.690, 0.540, 0.447), strict=True))
+    assert (tmp_path / "defocus-stack.png").stat().st_size > 10_000
