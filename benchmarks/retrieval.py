@@ -181,10 +181,10 @@ def _picture(rows: list[dict[str, Any]]) -> Figure:
     names = list(dict.fromkeys(row["method"].split(",")[0] for row in rows))
     for row in rows:
         name = row["method"].split(",")[0]
-        dim = row["photons"] == 1e4
-        axes.plot(row["seconds"], row["error"], "o" if dim else "s", color=f"C{names.index(name)}", mfc="none" if dim
-                  else None, label=f"{name}, {row['photons']:.0e} photons")  # fmt: skip
-        if "Gerchberg" in name and dim:
+        marker = dict(zip((1e4, 1e5, 1e6), "os^", strict=True))[row["photons"]]
+        axes.plot(row["seconds"], row["error"], marker, color=f"C{names.index(name)}", mfc="none",
+                  label=f"{name}, {row['photons']:.0e} photons")  # fmt: skip
+        if "Gerchberg" in name and row["photons"] == 1e4:
             axes.annotate(row["method"].split(", ")[1], (row["seconds"], row["error"]), (4, 4),
                           textcoords="offset points", fontsize=7)  # fmt: skip
     handles, labels = axes.get_legend_handles_labels()
