@@ -26,6 +26,7 @@ from .records import (
     Retrieved,
 )
 from .recovery.base import recover
+from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
 from .recovery.ridge import Ridge
 from .registration import Registration, register_facets
 from .retrieval.accelerated import Accelerated
@@ -41,6 +42,7 @@ __all__ = [
     "Calibration",
     "CalibrationFields",
     "Defocus",
+    "DenoiseStatus",
     "Diversity",
     "Drift",
     "Fibrelets",
@@ -56,9 +58,11 @@ __all__ = [
     "RetrievalStatus",
     "Retrieved",
     "Ridge",
+    "Solution",
     "Transmission",
     "TransportOfIntensity",
     "angular_spectrum",
+    "basis_pursuit_denoise",
     "find_fibrelets",
     "holograms",
     "load",
