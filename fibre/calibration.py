@@ -108,10 +108,12 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
         weight.append(np.ones(len(owner)))
     away, squared = np.concatenate(distance), np.concatenate(power)
     furthest = np.quantile(away, 0.98) if sum(len(p) for p in lit) > len(lit) else np.median(away)
-    edges = np.linspace(0, furthest, 13)
+    # coupling falls within a few fibrelets, however far apart the spots are
+    pitch = float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
+    edges = np.linspace(0, furthest, max(12, int(np.ceil(furthest / (0.7 * pitch)))) + 1)
     index = np.digitize(away, edges) - 1
     middle, mean = [], []
-    for b in range(12):
+    for b in range(len(edges) - 1):
         inside = squared[index == b]
         # from the first bin that noise could have made, the tail is extrapolated
         if len(inside) < 5 or inside.mean() < 4 * inside.std() / np.sqrt(len(inside)):
@@ -128,17 +130,18 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
 
 @dataclass(frozen=True)
 class _Regressions:
-    """The regression of some fibrelets on the inputs near them, padded to a common number q of points.
+    r"""The regression of some fibrelets on the inputs near them, padded to a common number q of points.
 
-    cores: (k,). chosen: (k, 2 q), indices of the inputs (h of the points, then v). prior: (k, 2 q), T, 0 where padded.
-    x: (k, 2 q, captures), the inputs. right: X^H T. systems: C for either polarisation of the output, (2, k, c, c).
+    cores: (k,). chosen: (k, 2 q), indices of the inputs (h of the points, then v). root: (k, 2 q), the root of T, 0
+    where padded. scaled: (k, 2 q, captures), T^1/2 X. weight: 1/var, (2, k, captures) for either polarisation of the
+    output. systems: :math:`G = 1 + T^{1/2} X \, \mathrm{diag}(1/\mathrm{var}) X^H T^{1/2}`, (2, k, 2 q, 2 q).
     """
 
     cores: np.ndarray
     chosen: np.ndarray
-    prior: np.ndarray
-    x: np.ndarray
-    right: np.ndarray
+    root: np.ndarray
+    scaled: np.ndarray
+    weight: np.ndarray
     systems: np.ndarray
 
 
@@ -158,23 +161,23 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         for i, core in enumerate(cores):
             points[i, : len(near[core])] = near[core]
         away = np.hypot(*np.moveaxis(positions[points] - fields.fibrelets.centres[cores][:, None], -1, 0))
-        prior = np.tile(np.where(points >= 0, profile(away), 0), 2)
-        chosen = np.where(prior > 0, np.concatenate([points, points + count], axis=1), 2 * count)
-        x = inputs[chosen]
-        right = x.conj().swapaxes(-1, -2) * prior[:, None]
-        noise = fields.variance[:, :, cores].transpose(1, 2, 0)
-        systems = right @ x + noise[..., None] * np.eye(noise.shape[-1])
-        yield _Regressions(cores, chosen, prior, x, right, systems)
+        root = np.sqrt(np.tile(np.where(points >= 0, profile(away), 0), 2))
+        chosen = np.where(root > 0, np.concatenate([points, points + count], axis=1), 2 * count)
+        scaled = root[..., None] * inputs[chosen]
+        weight = 1 / fields.variance[:, :, cores].transpose(1, 2, 0)
+        systems = (scaled * weight[:, :, None]) @ scaled.conj().swapaxes(-1, -2) + np.eye(root.shape[1])
+        yield _Regressions(cores, chosen, root, scaled, weight, systems)
 
 
 def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128) -> Columns:
     r"""Columns of A by linear regression with a local prior, one fibrelet at a time.
 
     A fibrelet's amplitude in capture c is :math:`y_c = \sum_j A_j x_{jc} + n_c` over all points j lit within reach.
-    With the prior :math:`A_j \sim CN(0, \tau^2(d_j))` of the measured :func:`coupling_profile` and T = diag tau^2,
+    With the prior :math:`A_j \sim CN(0, \tau^2(d_j))` of the measured :func:`coupling_profile`, T = diag tau^2 and
+    N = diag var,
 
-    .. math:: \hat A = y \, C^{-1} X^H T, \quad C = X^H T X + \mathrm{diag}(\mathrm{var}), \quad
-              \Sigma = T - T X C^{-1} X^H T
+    .. math:: \hat A = y N^{-1} X^H \Sigma, \quad \Sigma = (T^{-1} + X N^{-1} X^H)^{-1}
+              = T^{1/2} (1 + T^{1/2} X N^{-1} X^H T^{1/2})^{-1} T^{1/2}
 
     so spots that were lit together are told apart as well as the translations allow, and what stays ambiguous between
     them is in the covariance. Points beyond the distance at which the profile has fallen to ``fraction`` of its peak
@@ -183,15 +186,17 @@ def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128)
     count, cores = len(fields.points), len(fields.fibrelets.centres)
     rows, cols, values, variances = [], [], [], []
     for part in _regressions(fields, fraction, chunk):
-        real = part.prior > 0
+        real = part.root > 0
         for polarisation in range(2):
-            solved = np.linalg.solve(part.systems[polarisation], part.right)  # (k, captures, 2 q)
-            found = np.einsum("ck,kcj->kj", fields.fields[:, polarisation, part.cores], solved)
-            left = part.prior - np.einsum("kj,kjc,kcj->kj", part.prior, part.x, solved).real
+            inverse = np.linalg.inv(part.systems[polarisation])
+            weighted = part.weight[polarisation] * fields.fields[:, polarisation, part.cores].T
+            right = np.einsum("kjc,kc->kj", part.scaled.conj(), weighted)
+            found = part.root * np.einsum("kj,kji->ki", right, inverse)
+            left = part.root**2 * np.diagonal(inverse, axis1=1, axis2=2).real
             rows.append(np.broadcast_to(polarisation * cores + part.cores[:, None], real.shape)[real])
             cols.append(part.chosen[real])
             values.append(found[real])
-            variances.append(np.maximum(left[real], 0))
+            variances.append(left[real])
     place = (np.concatenate(rows), np.concatenate(cols))
     shape = (2 * cores, 2 * count)
     return Columns(
@@ -214,10 +219,9 @@ def response_covariance(
     cores = len(fields.fibrelets.centres)
     covariance = np.zeros((2 * cores, inputs.shape[1], inputs.shape[1]), complex)
     for part in _regressions(fields, fraction, chunk):
-        z = inputs[part.chosen]
-        bent = part.right @ z  # X^H T Z
+        z = part.root[..., None] * inputs[part.chosen]
         for polarisation in range(2):
-            explained = bent.conj().swapaxes(-1, -2) @ np.linalg.solve(part.systems[polarisation], bent)
-            before = (z.conj().swapaxes(-1, -2) * part.prior[:, None]) @ z
-            covariance[polarisation * cores + part.cores] = before - explained
+            covariance[polarisation * cores + part.cores] = z.conj().swapaxes(-1, -2) @ np.linalg.solve(
+                part.systems[polarisation], z
+            )
     return covariance
