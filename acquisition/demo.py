@@ -100,7 +100,7 @@ def run_demo(folder: str | Path, seed: int = 0, progress: bool = False, grid: tu
         calibration_fields = fibre.retrieve_fields(calibration, method, progress=progress)
     keep(calibration_fields, "calibration-fields.nc")
     with stage("inverse matrix"):
-        inverse = fibre.recover(calibration_fields, fibre.Ridge(), progress=progress)
+        inverse = fibre.recover(calibration_fields, fibre.ForwardInverse(), progress=progress)
     keep(inverse, "inverse.nc")
     with stage("fields of the sample"):
         fields = fibre.retrieve_fields(recording, method, calibration_fields.fibrelets, progress)

@@ -14,6 +14,7 @@ ALL = (
     *QUICK,
     "bundle",
     "images",
+    "recovery",
     "peers",
     "chain",
     "parts",

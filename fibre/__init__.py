@@ -26,8 +26,11 @@ from .records import (
     Retrieved,
 )
 from .recovery.base import recover
+from .recovery.basis_pursuit import BasisPursuit
 from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
+from .recovery.forward_inverse import ForwardInverse
 from .recovery.ridge import Ridge
+from .recovery.weighted_sum import WeightedSum
 from .registration import Registration, register_facets
 from .retrieval.accelerated import Accelerated
 from .retrieval.base import retrieve
@@ -38,6 +41,7 @@ from .transmission import Frame, Transmission
 
 __all__ = [
     "Accelerated",
+    "BasisPursuit",
     "Bundle",
     "Calibration",
     "CalibrationFields",
@@ -46,6 +50,7 @@ __all__ = [
     "Diversity",
     "Drift",
     "Fibrelets",
+    "ForwardInverse",
     "Frame",
     "GerchbergSaxton",
     "Images",
@@ -61,6 +66,7 @@ __all__ = [
     "Solution",
     "Transmission",
     "TransportOfIntensity",
+    "WeightedSum",
     "angular_spectrum",
     "basis_pursuit_denoise",
     "find_fibrelets",

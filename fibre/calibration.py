@@ -15,7 +15,7 @@ import scipy.spatial
 
 from fibre.records import CalibrationFields
 
-__all__ = ["Columns", "Profile", "columns", "coupling_profile", "response_covariance"]
+__all__ = ["Columns", "Profile", "columns", "coupling_profile", "lit_points", "response_covariance"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Profile:
         return float(self.distance[-1] + np.log(self.power[-1] / (fraction * self.power[0])) / self.decay)
 
 
-def _lit(fields: CalibrationFields) -> list[np.ndarray]:
+def lit_points(fields: CalibrationFields) -> list[np.ndarray]:
     """Points lit in each capture; every point must be lit somewhere, in two states or more."""
     inputs, count = fields.inputs.tocsc(), len(fields.points)
     lit = [np.unique(inputs.indices[inputs.indptr[c] : inputs.indptr[c + 1]] % count) for c in range(inputs.shape[1])]
@@ -96,7 +96,7 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
     centres = fields.fibrelets.centres[clean]
     distance, power, weight = [], [], []
-    lit = _lit(fields)
+    lit = lit_points(fields)
     for capture, points in enumerate(lit):
         if len(points) == 0:
             continue
@@ -148,7 +148,7 @@ class _Regressions:
 def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iterator[_Regressions]:
     count = len(fields.points)
     positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
-    _lit(fields)
+    lit_points(fields)
     profile = coupling_profile(fields)
     near = scipy.spatial.cKDTree(positions).query_ball_point(fields.fibrelets.centres, profile.reach(fraction))
     inputs = np.vstack([fields.inputs.toarray(), np.zeros(fields.inputs.shape[1])])  # last row: no point at all

@@ -82,16 +82,33 @@ def retrieve_command(
 @click.command("recover")
 @click.argument("fields", type=_PATH)
 @click.argument("out", type=_PATH)
-@click.option("--window", type=float, default=27.0, show_default=True, help="Side of the window, micrometres.")
+@click.option(
+    "--method",
+    type=click.Choice(["forward-inverse", "ridge", "basis-pursuit", "weighted-sum"]),
+    default="forward-inverse",
+    show_default=True,
+    help="basis-pursuit is the published one.",
+)
+@click.option("--window", type=float, help="Side of the window, micrometres; by default the method's own.")
+@click.option("--resume", "folder", type=_PATH, help="Keep finished rows in this folder, and go on from there.")
 @click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
-def recover_command(fields: Path, out: Path, window: float, overwrite: bool) -> None:
+def recover_command(
+    fields: Path, out: Path, method: str, window: float | None, folder: Path | None, overwrite: bool
+) -> None:
     """Inverse transmission matrix from the calibration FIELDS, written to OUT.
 
     Example: polinfer recover calibration-fields.nc inverse.nc
     """
-    from fibre import CalibrationFields, Ridge, recover, save
+    from fibre import BasisPursuit, CalibrationFields, ForwardInverse, Ridge, WeightedSum, recover, save
 
-    inverse = recover(_load(fields, (CalibrationFields,)), Ridge(window=window * 1e-6), progress=True)
+    kinds: dict[str, Any] = {
+        "forward-inverse": ForwardInverse,
+        "ridge": Ridge,
+        "basis-pursuit": BasisPursuit,
+        "weighted-sum": WeightedSum,
+    }
+    chosen = kinds[method]() if window is None else kinds[method](window=window * 1e-6)
+    inverse = recover(_load(fields, (CalibrationFields,)), chosen, progress=True, folder=folder)
     click.echo(f"wrote {save(inverse, out, overwrite=overwrite)}")
 
 

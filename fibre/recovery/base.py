@@ -1,4 +1,4 @@
-"""What every recovery method is, and the verb that runs one.
+"""What every recovery method is, the verb that runs one, and what methods that work row by row share.
 
 In: :class:`fibre.CalibrationFields` and a method. Out: :class:`fibre.Inverse`. Called by users and by the ``recover``
 command.
@@ -6,29 +6,171 @@ command.
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import scipy.sparse
+import scipy.spatial
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from fibre.calibration import lit_points, positions_on_camera
 from fibre.records import CalibrationFields, Inverse
 from polinfer.checks import one_of_types
+from polinfer.kept import Kept, fingerprint
+from polinfer.storage import array
 
-__all__ = ["RecoveryMethod", "recover"]
+__all__ = ["RecoveryMethod", "RowByRow", "recover"]
+
+PART = 64  # groups of points that are finished, and kept, together
 
 
 class RecoveryMethod(ABC):
     """A way to find A^-1 from calibration fields: a frozen object of settings with one function."""
 
     @abstractmethod
-    def solve(self, fields: CalibrationFields, progress: bool) -> Inverse:
+    def solve(self, fields: CalibrationFields, progress: bool, folder: str | Path | None) -> Inverse:
         """The inverse transmission matrix."""
 
 
-def recover(calibration_fields: CalibrationFields, method: RecoveryMethod, progress: bool = False) -> Inverse:
-    """The inverse transmission matrix from calibration fields, by ``method`` (for instance ``Ridge()``).
+def recover(
+    calibration_fields: CalibrationFields,
+    method: RecoveryMethod,
+    progress: bool = False,
+    folder: str | Path | None = None,
+) -> Inverse:
+    """The inverse transmission matrix from calibration fields, by ``method`` (for instance ``ForwardInverse()``).
 
-    Raises TypeError for other records and methods, ValueError where a point was lit in fewer than two states.
+    ``folder``: where finished rows are kept (made if absent), so that the same call goes on where it was interrupted;
+    None: nowhere. ``progress``: show a bar.
+
+    Raises TypeError for other records and methods, ValueError where a point was lit in fewer than two states, where a
+    window holds no usable fibrelet, and for a folder of another call.
     """
     one_of_types(
         "calibration_fields", calibration_fields, (CalibrationFields,), "make them with retrieve_fields(calibration)."
     )
-    one_of_types("method", method, (RecoveryMethod,), "pass an object such as Ridge().")
-    return method.solve(calibration_fields, progress)
+    one_of_types("method", method, (RecoveryMethod,), "pass an object such as ForwardInverse().")
+    return method.solve(calibration_fields, progress, folder)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Finished rows of some groups, sparse (2 p, 2 m): zero elsewhere."""
+
+    matrix: Any = array(("output", "mode"), "1/sqrt(photo-electrons/s)")
+
+
+class RowByRow(RecoveryMethod):
+    """A method that finds the rows of a point, or of neighbours that share a window, from the fibrelets in the window.
+
+    Groups do not depend on each other: they run in threads, and finished ones are kept.
+    """
+
+    window: float | None
+
+    def width(self, fields: CalibrationFields) -> float:
+        """Side of the window, metres: the setting, or, for None, the distance between spots that are lit together."""
+        return spot_spacing(fields) if self.window is None else self.window
+
+    @abstractmethod
+    def prepared(self, fields: CalibrationFields) -> Any:
+        """What all groups need, made once."""
+
+    @abstractmethod
+    def rows(self, prepared: Any, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Rows (2 g, c) of g ``points``, h of all then v, in the ``chosen`` c of the 2 m mode amplitudes."""
+
+    @abstractmethod
+    def usable(self, prepared: Any) -> np.ndarray:
+        """Which mode amplitudes rows may use, bool (2 m,)."""
+
+    @abstractmethod
+    def ridge(self, prepared: Any) -> float:
+        """For :attr:`fibre.Inverse.ridge`; 0 where there is none."""
+
+    def groups(self, positions: np.ndarray) -> list[np.ndarray]:
+        """Points that share a window, from where they are on the camera (p, 2); all p, each once."""
+        return [np.array([point]) for point in range(len(positions))]
+
+    def solve(self, fields: CalibrationFields, progress: bool, folder: str | Path | None = None) -> Inverse:
+        """See :meth:`RecoveryMethod.solve`."""
+        prepared = self.prepared(fields)
+        positions = positions_on_camera(fields)
+        groups = self.groups(positions)
+        usable, width = self.usable(prepared), self.width(fields)
+        tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
+        kept = None
+        if folder is not None:
+            kept = Kept(folder, fingerprint(fields_key(fields), self), (_Rows,), "calibration or method")
+        total = None
+        # small systems: threads of BLAS would cost more than they bring, and those of other groups bring it
+        with (
+            threadpool_limits(1, user_api="blas"),
+            ThreadPoolExecutor(os.cpu_count()) as pool,
+            tqdm(total=len(positions), desc="rows of A^-1", unit="point", disable=not progress) as bar,
+        ):
+            for start in range(0, len(groups), PART):
+                part = groups[start : start + PART]
+                name = f"rows_{start:06d}"
+                found = None if kept is None else kept.read(name)
+                if found is None:
+                    chosen = [_within(tree, width, positions[points], points, usable) for points in part]
+                    values = pool.map(self.rows, [prepared] * len(part), part, chosen)
+                    found = _Rows(_assembled(fields, zip(part, chosen, values, strict=True)))
+                    if kept is not None:
+                        kept.write(name, found)
+                total = found.matrix if total is None else total + found.matrix
+                bar.update(sum(map(len, part)))
+        return Inverse(scipy.sparse.csr_array(total), self.ridge(prepared), fields)
+
+
+def _within(
+    tree: scipy.spatial.cKDTree, width: float, positions: np.ndarray, points: np.ndarray, usable: np.ndarray
+) -> np.ndarray:
+    """Mode amplitudes in the square around the points, and its middle."""
+    middle = (positions.min(0) + positions.max(0)) / 2
+    near = np.asarray(sorted(tree.query_ball_point(middle, width / 2, p=np.inf)), int)
+    both = np.concatenate([near, near + tree.n])
+    both = both[usable[both]]
+    if len(both) == 0:
+        raise ValueError(f"window {width:g} m holds no usable fibrelet at point {points[0]}; widen it.")
+    return both
+
+
+def spot_spacing(fields: CalibrationFields) -> float:
+    """Least distance on the camera, metres, between spots that are lit together; infinite if none are."""
+    positions = positions_on_camera(fields)
+    least = np.inf
+    for points in lit_points(fields):
+        if len(points) > 1:
+            away, _ = scipy.spatial.cKDTree(positions[points]).query(positions[points], k=2)
+            least = min(least, float(away[:, 1].min()))
+    return least
+
+
+def fields_key(fields: CalibrationFields) -> tuple[np.ndarray, ...]:
+    """The arrays that an inverse depends on."""
+    return (
+        fields.fields, fields.variance, fields.reference, fields.fibrelets.centres, fields.inputs.toarray(),
+        fields.points, fields.registration,
+    )  # fmt: skip
+
+
+def _assembled(
+    fields: CalibrationFields, parts: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
+) -> scipy.sparse.csr_array:
+    count, cores = len(fields.points), len(fields.fibrelets.centres)
+    rows, columns, data = [], [], []
+    for points, chosen, values in parts:
+        rows.append(np.repeat(np.concatenate([points, points + count]), len(chosen)))
+        columns.append(np.tile(chosen, 2 * len(points)))
+        data.append(values.ravel())
+    place = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.csr_array((np.concatenate(data), place), shape=(2 * count, 2 * cores))

@@ -139,6 +139,12 @@ class _Problem:
         y = s * (self.right @ z)
         u, v = np.zeros_like(z), np.zeros_like(y)
         rho = 1 / np.maximum(np.abs(self.back @ (target / s)).max(0), 1e-300)
+        if start is not None:
+            # at a solution the multiplier is parallel to what is left of the data, as long as the weights allow
+            multiplier = target - y
+            slope = self.back @ (s * multiplier)
+            length = np.maximum((np.abs(slope) / w).max(0) * rho, 1e-300)
+            u, v = slope / length, -multiplier / length
         number = 0
         for number in range(1, iterations + 1):
             p, q = z - u, y - v
@@ -160,7 +166,7 @@ class _Problem:
             # residuals of both constraints against their change: the larger one says which way the step length is off
             primal = np.hypot(np.linalg.norm(x - z, axis=0), np.linalg.norm(ax - y, axis=0))
             dual = np.hypot(np.linalg.norm(z - z_before, axis=0), np.linalg.norm(y - y_before, axis=0))
-            change = np.clip(np.sqrt(primal / np.maximum(dual, 1e-300)), 0.2, 5)
+            change = np.clip(np.sqrt(primal / np.maximum(dual, 0.01 * primal + 1e-300)), 0.2, 5)
             settle = (number > iterations // 2) | ((change > 1 / 3) & (change < 3))
             change = np.where(settle, 1, change)
             rho, u, v = rho * change, u / change, v / change

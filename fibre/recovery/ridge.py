@@ -1,77 +1,99 @@
-"""Rows of A^-1 by ridge regression in a window, regularised by the calibration's own noise."""
+"""Rows of A^-1 straight from the calibration's captures, by ridge regression in a window."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
-import scipy.spatial
-from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
-from fibre.calibration import columns
-from fibre.records import CalibrationFields, Inverse
-from fibre.recovery.base import RecoveryMethod
+from fibre.calibration import clean_fibrelets, lit_points
+from fibre.records import CalibrationFields
+from fibre.recovery.base import RowByRow
 from polinfer.checks import real_number
 
-__all__ = ["Ridge"]
+__all__ = ["Captures", "Ridge", "ridge_rows"]
+
+
+class Captures(NamedTuple):
+    """fields: (captures, 2 m). noise: (2 m,), variances summed over the captures. inputs: (2 p, captures). usable:
+    (2 m,), modes without the reference spot."""
+
+    fields: np.ndarray
+    noise: np.ndarray
+    inputs: np.ndarray
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, fields: CalibrationFields) -> Captures:
+        """Of a calibration in which every point was lit in two states or more."""
+        lit_points(fields)
+        count = len(fields.fields)
+        noise = fields.variance.sum(0).ravel()
+        return cls(
+            fields.fields.reshape(count, -1), noise, fields.inputs.toarray(), np.tile(clean_fibrelets(fields), 2)
+        )
+
+    def targets(self, points: np.ndarray) -> np.ndarray:
+        """What lit the points in each capture, (2 g, captures)."""
+        return self.inputs[np.concatenate([points, points + len(self.inputs) // 2])]
+
+
+def ridge_rows(captures: Captures, points: np.ndarray, chosen: np.ndarray, strength: float) -> np.ndarray:
+    """Rows (2 g, c) by the formula of :class:`Ridge`; in the space of captures, of which there are fewer."""
+    seen = captures.fields[:, chosen]
+    # a = x (Y^H L^-1 Y + 1)^-1 Y^H L^-1, Y the captures' fields as columns
+    weighted = seen.conj() / np.maximum(strength * captures.noise[chosen], 1e-300)
+    system = weighted @ seen.T + np.eye(len(seen))
+    return np.asarray(scipy.linalg.solve(system.T, captures.targets(points).T, assume_a="pos").T @ weighted)
 
 
 @dataclass(frozen=True)
-class Ridge(RecoveryMethod):
-    r"""The row that errs least on average, given what the calibration knows.
+class Ridge(RowByRow):
+    r"""The inverse's rows by ridge regression of the inputs on the measured fields.
 
-    For the fibrelets in a window around a point, with the columns :math:`\hat A` and their variances,
+    .. math:: a = \arg\min \; \sum_c | x_c - a\, y_c |^2 + \sum_k |a_k|^2 \Lambda_k, \quad
+              \Lambda_k = \sum_c \mathrm{var}(y_{ck})
 
-    .. math:: a = \arg\min \; \| e - a \hat A \|^2 + \sum_k |a_k|^2 \Lambda_k, \quad
-              \Lambda_k = \sum_j \mathrm{var}(\hat A_{kj})
-
-    which is the expectation of :math:`\|e - a A\|^2` over the true A given the measured fields. So the
-    regularisation is set by the noise and not by hand; ``strength`` multiplies it.
+    over captures c, in which the point was lit with x_c (mostly 0) and the fibrelets in the window around it were seen
+    with y_c: what is expected of new fields of the same statistics, seen with the same noise. No columns of A are
+    found, and nothing is assumed of them but that spots that are lit together do not share a window: always alike, they
+    could not be told apart.
 
     Parameters
     ----------
-    window: metres, side of the square of fibrelets that a row may use. strength: >= 0, 1 is the noise's own.
+    window: metres, side of the square of fibrelets that a row may use; None: the distance between spots that are lit
+    together, at most 27 um. strength: >= 0 times the noise's own.
 
-    Source: errors-in-variables ridge regression; the paper's window is the spacing of parallel spots, 68.2 um.
+    Source: minimum mean squared error, Tikhonov regularisation in the paper's window.
     """
 
-    window: float = 27e-6
+    window: float | None = None
     strength: float = 1.0
 
     def __post_init__(self) -> None:
-        real_number("window", self.window, above=0)
+        if self.window is not None:
+            real_number("window", self.window, above=0)
         real_number("strength", self.strength, low=0)
 
-    def solve(self, fields: CalibrationFields, progress: bool) -> Inverse:
-        """See :meth:`RecoveryMethod.solve`."""
-        known = columns(fields)
-        count, cores = len(fields.points), len(fields.fibrelets.centres)
-        values, variance = known.values, known.variance
-        # noise summed over all inputs, for both polarisations of the input
-        ridge = self.strength * np.asarray(variance.sum(axis=1)).ravel()
-        observed = np.diff(values.indptr) > 0
-        tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
-        near = tree.query_ball_point(known.positions, self.window / 2, p=np.inf)
-        rows, cols, data = [], [], []
-        for point in tqdm(range(count), desc="rows of A^-1", unit="point", disable=not progress):
-            chosen = np.asarray(sorted(near[point]), int)
-            chosen = np.concatenate([chosen, chosen + cores])
-            chosen = chosen[observed[chosen]]
-            if len(chosen) == 0:
-                raise ValueError(f"window {self.window:g} m holds no usable fibrelet at point {point}; widen it.")
-            block = values[chosen]
-            gram = (block @ block.conj().T).toarray() + np.diag(ridge[chosen])
-            target = block[:, [point, point + count]].toarray()  # a = e A^H (A A^H + L)^-1
-            # a hundred unknowns: threads would cost more than they bring, and fight with other programs
-            with threadpool_limits(1, user_api="blas"):
-                row = scipy.linalg.solve(gram, target, assume_a="pos").conj().T
-            rows.append(np.repeat([point, point + count], len(chosen)))
-            cols.append(np.tile(chosen, 2))
-            data.append(row.ravel())
-        place = (np.concatenate(rows), np.concatenate(cols))
-        matrix = scipy.sparse.csr_array((np.concatenate(data), place), shape=(2 * count, 2 * cores))
-        scale = float((abs(values).power(2)).sum() / observed.sum())
-        return Inverse(matrix, float(ridge[observed].mean() / scale), fields)
+    def width(self, fields: CalibrationFields) -> float:
+        """See :meth:`RowByRow.width`."""
+        return min(27e-6, super().width(fields)) if self.window is None else self.window
+
+    def prepared(self, fields: CalibrationFields) -> Captures:
+        """See :meth:`RowByRow.prepared`."""
+        return Captures.of(fields)
+
+    def usable(self, prepared: Captures) -> np.ndarray:
+        """See :meth:`RowByRow.usable`."""
+        return prepared.usable
+
+    def ridge(self, prepared: Captures) -> float:
+        """Mean over the modes, in units of their mean power."""
+        power = (np.abs(prepared.fields) ** 2).sum(0)
+        return float(self.strength * prepared.noise.mean() / power.mean())
+
+    def rows(self, prepared: Captures, points: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """See :meth:`RowByRow.rows`."""
+        return ridge_rows(prepared, points, chosen, self.strength)

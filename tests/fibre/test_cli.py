@@ -5,7 +5,18 @@ import pytest
 import scipy.spatial
 from click.testing import CliRunner
 
-from fibre import CalibrationFields, RecordingFields, Ridge, load, reconstruct, recover, save
+from fibre import (
+    BasisPursuit,
+    CalibrationFields,
+    ForwardInverse,
+    RecordingFields,
+    Ridge,
+    WeightedSum,
+    load,
+    reconstruct,
+    recover,
+    save,
+)
 from polinfer.cli import main
 
 
@@ -37,7 +48,7 @@ def test_frames_become_jones_data_by_four_commands(bench, tmp_path):
     assert distance.max() < 0.5e-6
     assert len(set(core)) == len(core) > 25
     assert found.fibrelets.mode_radius.mean() == pytest.approx(1.6e-6, rel=0.03)
-    expected = reconstruct(recover(found, Ridge(window=30e-6)), load(sample_fields))
+    expected = reconstruct(recover(found, ForwardInverse(window=30e-6)), load(sample_fields))
     np.testing.assert_allclose(load(measurement).response, expected.response, rtol=1e-9)
     np.testing.assert_allclose(load(measurement).sigma, expected.sigma, rtol=1e-9)
 
@@ -63,6 +74,18 @@ def test_other_methods_of_retrieval_see_the_same_fields(bench, tmp_path, method)
     other = run("retrieve", calibration, out, "--fibrelets", known, "--resume", kept, "--overwrite")
     assert other.exit_code == 2
     assert "belongs to another record, method" in other.output
+
+
+def test_methods_of_recovery_are_those_of_the_library(bench, tmp_path):
+    fields = save(bench.calibration_fields, tmp_path / "fields.nc")
+    for name, method in {"ridge": Ridge(), "basis-pursuit": BasisPursuit(), "weighted-sum": WeightedSum()}.items():
+        result = run("recover", fields, tmp_path / f"{name}.nc", "--method", name, "--resume", tmp_path / name)
+        assert result.exit_code == 0, result.output
+        expected = recover(bench.calibration_fields, method).matrix.toarray()
+        np.testing.assert_allclose(load(tmp_path / f"{name}.nc").matrix.toarray(), expected, rtol=1e-6, atol=1e-12)
+    other = run("recover", fields, tmp_path / "other.nc", "--resume", tmp_path / "ridge")
+    assert other.exit_code == 2
+    assert "belongs to another calibration or method" in other.output
 
 
 @pytest.mark.parametrize("command", ["retrieve", "recover", "reconstruct"])

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse
 
 import fibre
-from fibre import Bundle, Defocus, Fibrelets, Images, Recording, Ridge, load, recover, save
+from fibre import Bundle, Defocus, Fibrelets, ForwardInverse, Images, Recording, load, recover, save
 from fibre.files import TYPES
 from tests.fibre.test_records import calibration
 
@@ -57,7 +57,7 @@ def records(standard):
         fibre.Retrieved(complex_stack(2, 3, 4).astype(np.complex64), np.ones((2, 3, 4)), np.array([0, 3], np.uint8),
                         np.array([5, 6], np.int32)),
         calibrated,
-        recover(calibrated, Ridge()),
+        recover(calibrated, ForwardInverse()),
         standard.recording(sample, standard.light(), 0.01, 0),
     ]  # fmt: skip
     return {type(record).__name__: record for record in made}

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fibre import Fibrelets, Ridge, reconstruct, recover
+from fibre import Fibrelets, ForwardInverse, reconstruct, recover
 
 NOISE = 0.003
 
 
 @pytest.fixture(scope="module")
 def inverse(standard):
-    return recover(standard.calibration(NOISE, 0), Ridge())
+    return recover(standard.calibration(NOISE, 0), ForwardInverse())
 
 
 def jones_of(measurement):
@@ -33,7 +33,7 @@ def repeats(standard, calibration_noise, noise, count=8):
     jones, light = standard.smooth_sample(), standard.light()
     squared, stated = [], []
     for k in range(count):
-        found = recover(standard.calibration(calibration_noise, 100 + k), Ridge())
+        found = recover(standard.calibration(calibration_noise, 100 + k), ForwardInverse())
         data = reconstruct(found, standard.recording(jones, light, noise, 1000 + k))
         squared.append(weighted_error(data, jones))
         stated.append(data.sigma.ravel() ** 2)
@@ -69,7 +69,7 @@ def test_the_common_error_of_the_calibration_cancels_without_a_sample(standard):
     """A calibration error enters sample and blank alike: where they are alike, only the recording's noise is left."""
     nothing = np.broadcast_to(np.eye(2), (64, 2, 2))
     sample = standard.smooth_sample()
-    inverse = recover(standard.calibration(0.02, 0), Ridge())
+    inverse = recover(standard.calibration(0.02, 0), ForwardInverse())
     quiet = reconstruct(inverse, standard.recording(nothing, standard.light(), 1e-5, 5))
     changed = reconstruct(inverse, standard.recording(sample, standard.light(), 1e-5, 5))
     assert np.median(quiet.sigma) < 0.05 * np.median(changed.sigma)

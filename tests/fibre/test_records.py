@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fibre import Calibration, Defocus, Diversity, Fibrelets, GerchbergSaxton, Images, Recording, Ridge, retrieve
+from fibre import (
+    Calibration,
+    Defocus,
+    Diversity,
+    Fibrelets,
+    ForwardInverse,
+    GerchbergSaxton,
+    Images,
+    Recording,
+    retrieve,
+)
 from fibre.propagation import transfer_function
 
 CUBE = np.ones((3, 8, 8))
@@ -86,8 +96,8 @@ def test_wrong_records_are_named_in_one_line(make, changes, error, text):
         (lambda: GerchbergSaxton(iterations=0), ValueError, "iterations must be >= 1"),
         (lambda: GerchbergSaxton(averaging=2.0), TypeError, "averaging must be an integer"),
         (lambda: GerchbergSaxton(tolerance=-1.0), ValueError, "tolerance must be >= 0"),
-        (lambda: Ridge(window=0.0), ValueError, "window must be > 0"),
-        (lambda: Ridge(strength=-1.0), ValueError, "strength must be >= 0"),
+        (lambda: ForwardInverse(window=0.0), ValueError, "window must be > 0"),
+        (lambda: ForwardInverse(strength=-1.0), ValueError, "strength must be >= 0"),
         (lambda: retrieve(CUBE, GerchbergSaxton()), TypeError, "diversity must be Diversity"),
         (lambda: retrieve(diversity(), "gerchberg"), TypeError, "method must be RetrievalMethod"),
     ],
