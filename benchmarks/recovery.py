@@ -17,6 +17,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 import scipy.spatial
+from matplotlib.figure import Figure
 
 from acquisition import CalibrationPlan
 from benchmarks.results import Results
@@ -37,6 +39,9 @@ from fibre import (
     WeightedSum,
     basis_pursuit_denoise,
     recover,
+    refresh,
+    staleness,
+    update_matrix,
 )
 from fibre.calibration import coupling_profile
 from polinfer import datasets
@@ -252,13 +257,72 @@ def certificates(results: Results, count: int) -> None:
     results.bar("false certificates", wrong, 0)
 
 
+def ageing(results: Results, count: int) -> Figure:
+    """How surely a few probes tell that a small bundle has warmed, and what they mend; receiver operating curves."""
+    scene = Scene((8, 8), stride=4)
+    inverse = recover(scene.fields, ForwardInverse())
+    rng = np.random.default_rng(2)
+    launch = scene.bundle.launch(scene.points, WAIST)
+    both = scipy.sparse.block_diag([launch, launch], format="csc")
+    figure = Figure(figsize=(4.6, 3.6), layout="constrained")
+    axes = figure.subplots()
+
+    def probes(matrix: Any, number: int) -> CalibrationFields:
+        inputs = noise(rng, 2 * len(scene.points), number) / 2
+        clean = matrix @ inputs
+        fields = (clean + scene.level * noise(rng, *clean.shape)).T.reshape(number, 2, -1)
+        return replace(scene.fields, fields=fields, variance=np.full(fields.shape, scene.level**2),
+                       inputs=scipy.sparse.csr_array(inputs))  # fmt: skip
+
+    still = np.array([staleness(inverse, probes(scene.matrix, 2)).probability for _ in range(count)])
+    for heating in (1e-3, 2e-3, 4e-3, 1e-2):
+        warm = scene.bundle.disturbed(heating=heating).columns(both, faint=1e-7)
+        found = [staleness(inverse, probes(warm, 2)) for _ in range(count)]
+        probability = np.array([f.probability for f in found])
+        levels = np.sort(np.concatenate([still, probability, [0, 1]]))
+        false, true = (np.array([np.mean(p <= level) for level in levels]) for p in (still, probability))
+        area = float(np.trapezoid(true, false))
+        change = float(np.median([f.change for f in found]))
+        refreshed = refresh(inverse, probes(warm, 20))
+        z = noise(rng, 2 * len(scene.points), 20)
+        errors = [float(np.linalg.norm(m.matrix @ (warm @ z) - z) / np.linalg.norm(z)) for m in (inverse, refreshed)]
+        results.add(heating=heating, probes=2, area_under_curve=area, change_found=change,
+                    alarms_at_5_percent=float(np.mean(probability < 0.05)), error_old=errors[0],
+                    error_refreshed_by_20=errors[1])  # fmt: skip
+        axes.plot(false, true, label=f"heated by {heating:g}: change {change:.3f}")
+    axes.set(xlabel="false alarms", ylabel="changes noticed", title="two probes, 2 % noise")
+    axes.legend(fontsize=8, loc="lower right")
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def pressed(results: Results) -> None:
+    """The measured fibre, pressed further: old matrix, a fresh recovery from the probes alone, and both together."""
+    states = ("5.0", "5.04", "5.12")
+    matrices = [datasets.multimode_fibre(s).jones.transpose(2, 0, 3, 1).reshape(110, 110) for s in states]
+    rng = np.random.default_rng(3)
+    for name, true in zip(("5.04", "5.12"), matrices[1:], strict=True):
+        for count in (10, 20, 40):
+            x = noise(rng, 110, count)
+            level = NOISE * np.sqrt((np.abs(true @ x) ** 2).mean())
+            y = true @ x + level * noise(rng, 110, count)
+            scaled = matrices[0] * np.vdot(matrices[0] @ x, y) / np.linalg.norm(matrices[0] @ x) ** 2
+            fresh = basis_pursuit_denoise(x.T, y.T, level * np.sqrt(count)).x.T
+            updated = update_matrix(matrices[0], x, y, level)
+            off = [float((np.linalg.norm(a - true, axis=1) / np.linalg.norm(true, axis=1)).mean())
+                   for a in (scaled, fresh, updated)]  # fmt: skip
+            results.add(pressed_to=name, probes=count, error_old=off[0], error_fresh=off[1], error_updated=off[2])
+            results.bar(f"{name}, {count} probes: error over the better of old and fresh", off[2] / min(off[:2]), 1.0)
+
+
 def main(size: int | None = None, full: bool = False) -> None:
     """Print the tables; ``size``: points along each axis instead of 27 x 36."""
     results = Results("recovery")
     methods(results, size, full)
     solvers(results)
     certificates(results, 1000 if full else 100)
-    results.save()
+    pressed(results)
+    results.save(ageing(results, 200 if full else 40))
 
 
 if __name__ == "__main__":

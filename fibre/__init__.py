@@ -29,6 +29,7 @@ from .recovery.base import recover
 from .recovery.basis_pursuit import BasisPursuit
 from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
 from .recovery.forward_inverse import ForwardInverse
+from .recovery.refresh import Staleness, refresh, staleness, update_matrix
 from .recovery.ridge import Ridge
 from .recovery.weighted_sum import WeightedSum
 from .registration import Registration, register_facets
@@ -64,6 +65,7 @@ __all__ = [
     "Retrieved",
     "Ridge",
     "Solution",
+    "Staleness",
     "Transmission",
     "TransportOfIntensity",
     "WeightedSum",
@@ -74,10 +76,13 @@ __all__ = [
     "load",
     "reconstruct",
     "recover",
+    "refresh",
     "register_facets",
     "relative_phase",
     "retrieve",
     "retrieve_fields",
     "save",
+    "staleness",
     "track_drift",
+    "update_matrix",
 ]

@@ -15,7 +15,7 @@ import scipy.spatial
 
 from fibre.records import CalibrationFields
 
-__all__ = ["Columns", "Profile", "columns", "coupling_profile", "lit_points", "response_covariance"]
+__all__ = ["Columns", "Profile", "columns", "coupling_profile", "lit_points", "response_covariance", "usual_response"]
 
 
 @dataclass(frozen=True)
@@ -224,4 +224,20 @@ def response_covariance(
             covariance[polarisation * cores + part.cores] = z.conj().swapaxes(-1, -2) @ np.linalg.solve(
                 part.systems[polarisation], z
             )
+    return covariance
+
+
+def usual_response(
+    fields: CalibrationFields, inputs: np.ndarray, fraction: float = 1e-5, chunk: int = 128
+) -> np.ndarray:
+    r"""Covariance of responses to given distal fields before looking closer: :math:`Z^H T Z`.
+
+    T are the variances of the :func:`coupling_profile`. Complex (2 m, s, s), as :func:`response_covariance`.
+    """
+    inputs = np.vstack([inputs, np.zeros(inputs.shape[1])])
+    cores = len(fields.fibrelets.centres)
+    covariance = np.zeros((2 * cores, inputs.shape[1], inputs.shape[1]), complex)
+    for part in _regressions(fields, fraction, chunk):
+        z = part.root[..., None] * inputs[part.chosen]
+        covariance[part.cores] = covariance[cores + part.cores] = z.conj().swapaxes(-1, -2) @ z
     return covariance
