@@ -38,8 +38,8 @@ class Frame:
     """Square pixels on which a field is sampled. shape: (y, x). pixel_size: metres. The axis is the middle.
 
     >>> from fibre import Frame
-    >>> Frame((4, 6), 2e-6).points[0].tolist()
-    [-3e-06, -5e-06]
+    >>> (Frame((4, 6), 2e-6).points[0] * 1e6).round(3).tolist()
+    [-3.0, -5.0]
     """
 
     shape: tuple[int, int]

@@ -54,13 +54,13 @@ class Kept:
     ValueError: the folder belongs to another call or holds other files.
 
     >>> import tempfile
-    >>> from polinfer import Parameters
-    >>> kept = Kept(Path(tempfile.mkdtemp()) / "new", fingerprint("call"), (Parameters,), "call")
+    >>> from polinfer import Measurement
+    >>> kept = Kept(Path(tempfile.mkdtemp()) / "new", fingerprint("call"), (Measurement,), "call")
     >>> kept.read("first") is None
     True
-    >>> kept.write("first", Parameters(*np.zeros((5, 2))))
-    >>> kept.read("first").retardance.tolist()
-    [0.0, 0.0]
+    >>> kept.write("first", Measurement(np.eye(2), np.eye(2), sigma=0.1))
+    >>> kept.read("first").sigma.item()
+    0.1
     """
 
     def __init__(self, folder: str | Path, name: str, kinds: tuple[type, ...], belongs_to: str) -> None:
