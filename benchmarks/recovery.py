@@ -275,7 +275,7 @@ def ageing(results: Results, count: int) -> Figure:
                        inputs=scipy.sparse.csr_array(inputs))  # fmt: skip
 
     still = np.array([staleness(inverse, probes(scene.matrix, 2)).probability for _ in range(count)])
-    for heating in (1e-3, 2e-3, 4e-3, 1e-2):
+    for heating in (1e-4, 2e-4, 4e-4, 1e-3, 1e-2):
         warm = scene.bundle.disturbed(heating=heating).columns(both, faint=1e-7)
         found = [staleness(inverse, probes(warm, 2)) for _ in range(count)]
         probability = np.array([f.probability for f in found])

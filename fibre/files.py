@@ -19,6 +19,7 @@ from fibre.records import (
     RecordingFields,
     Retrieved,
 )
+from fibre.recovery.refresh import Staleness
 from fibre.registration import Registration
 from polinfer import storage
 from polinfer.files import TYPES as BELOW
@@ -39,6 +40,7 @@ TYPES: tuple[type, ...] = (
     RecordingFields,
     Registration,
     Retrieved,
+    Staleness,
 )
 
 
