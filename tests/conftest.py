@@ -6,9 +6,12 @@ import os
 from pathlib import Path
 
 import jax
+from threadpoolctl import threadpool_limits
 
 # The library never decides about precision; its tests run in double unless told otherwise.
 jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != "0")
+# The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way.
+BLAS = threadpool_limits(1, user_api="blas")
 # Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
 # otherwise, and the processes of a run share what they compile.
 jax.config.update("jax_disable_most_optimizations", os.environ.get("POLINFER_TEST_OPTIMISED", "0") == "0")
