@@ -108,7 +108,9 @@ def test_probes_of_another_calibration_are_refused(standard, inverse):
         refresh(inverse, moved)
 
 
-@pytest.mark.parametrize(("state", "count"), [("5.04", 10), ("5.12", 20), pytest.param("5.04", 40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("state", "count"), [("5.04", 10), ("5.12", 20), pytest.param("5.04", 40, marks=pytest.mark.slow)]
+)
 def test_a_measured_fibre_that_was_pressed_is_followed(state, count):
     """5.04: small changes all over. 5.12: nothing of the old matrix is left but where it was strong."""
     fibre_folder()
