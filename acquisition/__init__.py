@@ -4,7 +4,7 @@ from .bench.scene import CameraModel, Scene
 from .bench.simulator import SimulatedBench
 from .contracts import Bench
 from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
-from .plan import CalibrationPlan, SamplePlan, Step, Timing, Views, elliptical_states
+from .plan import CalibrationPlan, GridPlan, PatternPlan, SamplePlan, Step, Timing, Views, elliptical_states
 from .run import calibrate, capture
 
 __all__ = [
@@ -12,9 +12,11 @@ __all__ = [
     "Bracket",
     "CalibrationPlan",
     "CameraModel",
+    "GridPlan",
     "InverseVariance",
     "LongestUnsaturated",
     "Merged",
+    "PatternPlan",
     "SamplePlan",
     "Scene",
     "SimulatedBench",

@@ -18,7 +18,17 @@ import scipy.sparse
 from acquisition.exposure import Bracket
 from polinfer.checks import integer, one_of_types, real_array, real_number
 
-__all__ = ["CalibrationPlan", "Plan", "SamplePlan", "Step", "Timing", "Views", "elliptical_states"]
+__all__ = [
+    "CalibrationPlan",
+    "GridPlan",
+    "PatternPlan",
+    "Plan",
+    "SamplePlan",
+    "Step",
+    "Timing",
+    "Views",
+    "elliptical_states",
+]
 
 
 def elliptical_states(count: int = 3) -> np.ndarray:
@@ -42,12 +52,14 @@ class Timing:
 @dataclass(frozen=True)
 class Step:
     """One capture: what is lit. ``kind`` is reference (the reference spot alone), spots, blank or sample; ``points``
-    are the lit distal points of a spots step, ``state`` the column of the plan's states."""
+    are the lit distal points of a spots step, ``amplitudes`` theirs (none: 1), ``state`` the column of the plan's
+    states."""
 
     id: str
     kind: str
     points: tuple[int, ...] = ()
     state: int = 0
+    amplitudes: tuple[complex, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -104,8 +116,65 @@ class Plan(ABC):
         return hashlib.sha256(text.encode()).hexdigest()
 
 
+class GridPlan(Plan):
+    """A plan that lights points of a grid with known amplitudes: what a calibration can be made of.
+
+    grid: (rows, columns) of distal points. pitch: metres between them. reference_every: captures between images of the
+    reference spot alone (the paper's 60 s are 7 captures).
+    """
+
+    grid: tuple[int, int]
+    pitch: float
+    reference_every: int
+
+    def _check_grid(self) -> None:
+        rows, columns = self.grid
+        object.__setattr__(self, "grid", (integer("grid", rows, low=1), integer("grid", columns, low=1)))
+        # kept as plain numbers: the hash must not depend on which kind of number was given
+        object.__setattr__(self, "pitch", real_number("pitch", self.pitch, above=0))
+        for name, low in (("states", 2), ("reference_every", 1)):
+            object.__setattr__(self, name, integer(name, getattr(self, name), low=low))
+        one_of_types("views", self.views, (Views,), "pass Views(...).")
+
+    @property
+    @abstractmethod
+    def spots(self) -> list[Step]:
+        """The captures that light points, in order."""
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Distal points, (p, 2) metres, row by row, centred."""
+        index = np.indices(self.grid).reshape(2, -1).T
+        return (index - (np.array(self.grid) - 1) / 2) * self.pitch
+
+    @cached_property
+    def captures(self) -> tuple[Step, ...]:
+        """See :class:`Plan`."""
+        steps: list[Step] = []
+        for count, spot in enumerate(self.spots):
+            if count % self.reference_every == 0:
+                steps.append(Step(f"reference-{count // self.reference_every}", "reference"))
+            steps.append(spot)
+        steps.append(Step("reference-last", "reference"))
+        return tuple(steps)
+
+    @property
+    def inputs(self) -> scipy.sparse.csr_array:
+        """Amplitudes at the points in every spots step, sparse complex (2 p, captures)."""
+        count = len(self.points)
+        spots = [step for step in self.captures if step.kind == "spots"]
+        row, column, value = [], [], []
+        for capture, step in enumerate(spots):
+            amplitudes = np.array(step.amplitudes) if step.amplitudes else np.ones(len(step.points))
+            for polarisation in range(2):
+                row += [polarisation * count + point for point in step.points]
+                column += [capture] * len(step.points)
+                value += (self.illumination[polarisation, step.state] * amplitudes).tolist()
+        return scipy.sparse.csr_array((np.array(value), (row, column)), shape=(2 * count, len(spots)))
+
+
 @dataclass(frozen=True)
-class CalibrationPlan(Plan):
+class CalibrationPlan(GridPlan):
     """Every distal point lit in every state, spots that are ``stride`` points apart at the same time.
 
     grid: (rows, columns) of distal points. pitch: metres between them. stride: points between parallel spots, per
@@ -125,23 +194,12 @@ class CalibrationPlan(Plan):
     views: Views = field(default_factory=Views)
 
     def __post_init__(self) -> None:
-        rows, columns = self.grid
-        object.__setattr__(self, "grid", (integer("grid", rows, low=1), integer("grid", columns, low=1)))
-        # kept as plain numbers: the hash must not depend on which kind of number was given
-        object.__setattr__(self, "pitch", real_number("pitch", self.pitch, above=0))
-        for name, low in (("stride", 1), ("states", 2), ("reference_every", 1)):
-            object.__setattr__(self, name, integer(name, getattr(self, name), low=low))
-        one_of_types("views", self.views, (Views,), "pass Views(...).")
+        self._check_grid()
+        object.__setattr__(self, "stride", integer("stride", self.stride, low=1))
 
-    @cached_property
-    def points(self) -> np.ndarray:
-        """Distal points, (p, 2) metres, row by row, centred."""
-        index = np.indices(self.grid).reshape(2, -1).T
-        return (index - (np.array(self.grid) - 1) / 2) * self.pitch
-
-    @cached_property
-    def captures(self) -> tuple[Step, ...]:
-        """See :class:`Plan`."""
+    @property
+    def spots(self) -> list[Step]:
+        """See :class:`GridPlan`."""
         index = np.arange(self.grid[0] * self.grid[1]).reshape(self.grid)
         spots = []
         for row in range(min(self.stride, self.grid[0])):
@@ -149,26 +207,54 @@ class CalibrationPlan(Plan):
                 lit = tuple(int(i) for i in index[row :: self.stride, column :: self.stride].ravel())
                 for state in range(self.states):
                     spots.append(Step(f"spots-{row}-{column}-state-{state}", "spots", lit, state))
-        steps: list[Step] = []
-        for count, spot in enumerate(spots):
-            if count % self.reference_every == 0:
-                steps.append(Step(f"reference-{count // self.reference_every}", "reference"))
-            steps.append(spot)
-        steps.append(Step("reference-last", "reference"))
-        return tuple(steps)
+        return spots
+
+
+@dataclass(frozen=True)
+class PatternPlan(GridPlan):
+    """Random patterns: a random share of the points lit with random phases, the same in every state.
+
+    Neighbouring points are lit at the same time, so that intensities alone tell the transmission matrix
+    (:class:`fibre.IntensityOnly`). A point carries less light than in a :class:`CalibrationPlan` of the same laser.
+
+    grid: (rows, columns) of distal points. pitch: metres between them. patterns: >= 1. share: of the points lit in a
+    pattern, 0 < share <= 1. seed: of patterns and phases. states, reference_every, views: as in
+    :class:`CalibrationPlan`.
+
+    >>> plan = PatternPlan(grid=(4, 6), patterns=5)
+    >>> plan.inputs.shape  # 5 patterns x 3 states
+    (48, 15)
+    """
+
+    grid: tuple[int, int] = (18, 18)
+    pitch: float = 4.2e-6
+    patterns: int = 60
+    share: float = 0.5
+    seed: int = 0
+    states: int = 3
+    reference_every: int = 7
+    views: Views = field(default_factory=Views)
+
+    def __post_init__(self) -> None:
+        self._check_grid()
+        object.__setattr__(self, "patterns", integer("patterns", self.patterns, low=1))
+        object.__setattr__(self, "seed", integer("seed", self.seed, low=0))
+        object.__setattr__(self, "share", real_number("share", self.share, above=0))
+        if self.share > 1:
+            raise ValueError(f"share must be <= 1, got {self.share}.")
 
     @property
-    def inputs(self) -> scipy.sparse.csr_array:
-        """Amplitudes at the points in every spots step, sparse complex (2 p, captures)."""
-        count = len(self.points)
-        spots = [step for step in self.captures if step.kind == "spots"]
-        row, column, value = [], [], []
-        for capture, step in enumerate(spots):
-            for polarisation in range(2):
-                row += [polarisation * count + point for point in step.points]
-                column += [capture] * len(step.points)
-                value += [self.illumination[polarisation, step.state]] * len(step.points)
-        return scipy.sparse.csr_array((np.array(value), (row, column)), shape=(2 * count, len(spots)))
+    def spots(self) -> list[Step]:
+        """See :class:`GridPlan`."""
+        generator = np.random.default_rng(self.seed)
+        count = self.grid[0] * self.grid[1]
+        spots = []
+        for pattern in range(self.patterns):
+            lit = np.sort(generator.choice(count, max(1, round(self.share * count)), replace=False))
+            phases = tuple(np.exp(2j * np.pi * generator.random(len(lit))).tolist())
+            for state in range(self.states):
+                spots.append(Step(f"pattern-{pattern}-state-{state}", "spots", tuple(lit.tolist()), state, phases))
+        return spots
 
 
 @dataclass(frozen=True)

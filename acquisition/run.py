@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from acquisition.contracts import Bench
-from acquisition.plan import CalibrationPlan, Plan, SamplePlan, Step, Views
+from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
 from polinfer.checks import one_of_types
@@ -20,12 +20,12 @@ from polinfer.checks import one_of_types
 __all__ = ["calibrate", "capture"]
 
 
-def calibrate(bench: Bench, plan: CalibrationPlan, folder: str | Path, progress: bool = False) -> Calibration:
+def calibrate(bench: Bench, plan: GridPlan, folder: str | Path, progress: bool = False) -> Calibration:
     """Capture a calibration, or what is missing of it in ``folder``.
 
     Raises ValueError where the folder holds another plan's or another bench's run, TypeError for other plans.
     """
-    one_of_types("plan", plan, (CalibrationPlan,), "pass CalibrationPlan(...).")
+    one_of_types("plan", plan, (GridPlan,), "pass CalibrationPlan(...) or PatternPlan(...).")
     store = _execute(bench, plan, folder, plan.points, progress)
     spots = [step for step in plan.captures if step.kind == "spots"]
     references = [step for step in plan.captures if step.kind == "reference"]

@@ -29,6 +29,8 @@ from .recovery.base import recover
 from .recovery.basis_pursuit import BasisPursuit
 from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
 from .recovery.forward_inverse import ForwardInverse
+from .recovery.intensity_only import IntensityOnly
+from .recovery.intensity_rows import Rows, RowStatus, rows_from_intensities
 from .recovery.refresh import Staleness, refresh, staleness, update_matrix
 from .recovery.ridge import Ridge
 from .recovery.weighted_sum import WeightedSum
@@ -55,6 +57,7 @@ __all__ = [
     "Frame",
     "GerchbergSaxton",
     "Images",
+    "IntensityOnly",
     "Interference",
     "Inverse",
     "Modal",
@@ -64,6 +67,8 @@ __all__ = [
     "RetrievalStatus",
     "Retrieved",
     "Ridge",
+    "RowStatus",
+    "Rows",
     "Solution",
     "Staleness",
     "Transmission",
@@ -81,6 +86,7 @@ __all__ = [
     "relative_phase",
     "retrieve",
     "retrieve_fields",
+    "rows_from_intensities",
     "save",
     "staleness",
     "track_drift",

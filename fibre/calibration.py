@@ -10,12 +10,26 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 import scipy.sparse
 import scipy.spatial
 
 from fibre.records import CalibrationFields
 
-__all__ = ["Columns", "Profile", "columns", "coupling_profile", "lit_points", "response_covariance", "usual_response"]
+__all__ = [
+    "Columns",
+    "Profile",
+    "columns",
+    "coupling_profile",
+    "lit_points",
+    "profile_of_patterns",
+    "response_covariance",
+    "usual_response",
+]
+
+
+DENSE = 2.0  # fibrelets between neighbouring spots, below which no fibrelet belongs to a single spot
+PATTERN_REACH = 8.0  # fibrelets: how far coupling is looked for where patterns are lit
 
 
 @dataclass(frozen=True)
@@ -91,12 +105,17 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
 
     Every fibrelet of a capture is ascribed to the lit point that is nearest; squared amplitudes, less their noise, are
     averaged in bins of distance and made to fall monotonically. Near the middle between two spots both contribute, so
-    the profile is a little too broad there: a weaker prior, not a wrong one.
+    the profile is a little too broad there: a weaker prior, not a wrong one. Spots nearer than two fibrelets to each
+    other: :func:`profile_of_patterns`.
     """
     positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
     centres = fields.fibrelets.centres[clean]
     distance, power, weight = [], [], []
     lit = lit_points(fields)
+    pitch = float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
+    if _spot_spacing(positions, lit) < DENSE * pitch:
+        powers = (np.abs(fields.fields) ** 2 - fields.variance).mean(1)[:, clean]
+        return profile_of_patterns(centres, positions, fields.inputs, powers, pitch)
     for capture, points in enumerate(lit):
         if len(points) == 0:
             continue
@@ -109,7 +128,6 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     away, squared = np.concatenate(distance), np.concatenate(power)
     furthest = np.quantile(away, 0.98) if sum(len(p) for p in lit) > len(lit) else np.median(away)
     # coupling falls within a few fibrelets, however far apart the spots are
-    pitch = float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
     edges = np.linspace(0, furthest, max(12, int(np.ceil(furthest / (0.7 * pitch)))) + 1)
     index = np.digitize(away, edges) - 1
     middle, mean = [], []
@@ -126,6 +144,58 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     tail = slice(len(middle) // 2, None)
     slope = np.polyfit(middle[tail], np.log(falling[tail]), 1)[0]
     return Profile(np.array(middle), falling, float(max(-slope, 1 / furthest)))
+
+
+def _spot_spacing(positions: np.ndarray, lit: list[np.ndarray]) -> float:
+    """Typical distance between a lit point and the next one, metres; infinite where they are single."""
+    several = [positions[points] for points in lit if len(points) > 1]
+    if not several:
+        return np.inf
+    return float(np.median(np.concatenate([scipy.spatial.cKDTree(p).query(p, k=2)[0][:, 1] for p in several])))
+
+
+def profile_of_patterns(
+    centres: np.ndarray, positions: np.ndarray, inputs: scipy.sparse.csr_array, powers: np.ndarray, pitch: float
+) -> Profile:
+    r"""The coupling profile where many neighbouring points are lit at once with random phases.
+
+    .. math:: E|y_{kc}|^2 = \sum_b \tau_b^2 \sum_{j: d_{kj} \in b} |x_{jc}|^2
+
+    for the random phases of A: non-negative least squares for the powers of all bins b of distance, each mean power
+    with a variance that is its square, as that of speckle is. ``powers``: (captures, m), less their noise.
+    """
+    edges = np.linspace(0, PATTERN_REACH * pitch, int(PATTERN_REACH / 0.5) + 1)
+    tree = scipy.spatial.cKDTree(centres)
+    pairs = tree.sparse_distance_matrix(scipy.spatial.cKDTree(positions), edges[-1], output_type="coo_matrix")
+    count = len(positions)
+    lit = np.asarray((abs(inputs[:count]).power(2) + abs(inputs[count:]).power(2)).toarray())
+    bins = np.digitize(pairs.data, edges) - 1
+    design = np.stack(
+        [
+            (scipy.sparse.csr_array(((bins == b) * 1.0, (pairs.row, pairs.col)), shape=pairs.shape) @ lit).T.ravel()
+            for b in range(len(edges) - 1)
+        ],
+        axis=1,
+    )
+    target = powers.ravel()
+    reached = design.sum(1) > 0
+    if np.count_nonzero(reached) < 10 * len(edges):
+        raise ValueError("calibration_fields have too few lit fibrelets to see how the coupling falls with distance.")
+    design, target = design[reached], target[reached]
+    weight = np.full(len(target), 1 / max(float(target.mean()), 1e-300))
+    for _ in range(4):
+        found = scipy.optimize.nnls(design * weight[:, None], target * weight)[0]
+        expected = design @ found
+        weight = 1 / np.maximum(expected, 1e-3 * expected.max())
+    # from the first bin that speckle could have made, the tail is extrapolated
+    uncertain = np.sqrt(np.diag(np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))))
+    good = np.flatnonzero(found < 3 * uncertain)
+    last = int(good[0]) if len(good) else len(found)
+    if last < 3:
+        raise ValueError("calibration_fields do not show how the coupling falls with distance; light fewer points.")
+    middle, falling = (edges[:-1] + edges[1:])[:last] / 2, np.minimum.accumulate(found[:last])
+    slope = np.polyfit(middle[last // 2 :], np.log(falling[last // 2 :]), 1)[0]
+    return Profile(middle, falling, float(max(-slope, 1 / edges[-1])))
 
 
 @dataclass(frozen=True)

@@ -279,15 +279,22 @@ def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> 
 
 
 def _groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Captures that light the same points, and their states (2, n)."""
+    """Captures that light the same points with the same amplitudes but for the state, and their states (2, n)."""
     inputs = calibration.inputs.tocsc()
     count = len(calibration.points)
-    groups: dict[tuple[int, ...], list[int]] = {}
+    groups: dict[tuple, list[int]] = {}
+    states = {}
     for capture in range(inputs.shape[1]):
-        rows = inputs.indices[inputs.indptr[capture] : inputs.indptr[capture + 1]]
-        groups.setdefault(tuple(sorted(set(rows % count))), []).append(capture)
-    return [
-        (np.array(captures), inputs[[points[0], points[0] + count], :][:, captures].toarray())
-        for points, captures in groups.items()
-        if points
-    ]
+        both = inputs[:, [capture]].toarray().reshape(2, count)
+        points = np.flatnonzero(np.any(both != 0, axis=0))
+        if len(points) == 0:
+            continue
+        # one state for all points: the field is the state times a pattern, which begins with 1
+        state = both[:, points[0]]
+        pattern = state.conj() @ both[:, points] / np.linalg.norm(state) ** 2
+        if not np.allclose(np.outer(state, pattern), both[:, points], rtol=1e-6):
+            continue  # points in different states: nothing must close
+        states[capture] = state
+        key = (*points.tolist(), *np.round(pattern, 6).tolist())
+        groups.setdefault(key, []).append(capture)
+    return [(np.array(found), np.stack([states[c] for c in found], 1)) for found in groups.values()]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse
@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from fibre.calibration import lit_points, positions_on_camera
-from fibre.records import CalibrationFields, Inverse
+from fibre.records import Calibration, CalibrationFields, Inverse
 from polinfer.checks import one_of_types
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
@@ -32,20 +32,27 @@ PART = 64  # groups of points that are finished, and kept, together
 
 
 class RecoveryMethod(ABC):
-    """A way to find A^-1 from calibration fields: a frozen object of settings with one function."""
+    """A way to find A^-1 from a calibration: a frozen object of settings with one function.
+
+    takes: the record that it wants, fields that are retrieved or the images themselves.
+    """
+
+    takes: ClassVar[type] = CalibrationFields
 
     @abstractmethod
-    def solve(self, fields: CalibrationFields, progress: bool, folder: str | Path | None) -> Inverse:
+    def solve(self, fields: Any, progress: bool, folder: str | Path | None) -> Inverse:
         """The inverse transmission matrix."""
 
 
 def recover(
-    calibration_fields: CalibrationFields,
+    calibration_fields: CalibrationFields | Calibration,
     method: RecoveryMethod,
     progress: bool = False,
     folder: str | Path | None = None,
 ) -> Inverse:
     """The inverse transmission matrix from calibration fields, by ``method`` (for instance ``ForwardInverse()``).
+
+    ``IntensityOnly()`` takes the :class:`fibre.Calibration` itself.
 
     ``folder``: where finished rows are kept (made if absent), so that the same call goes on where it was interrupted;
     None: nowhere. ``progress``: show a bar.
@@ -53,10 +60,11 @@ def recover(
     Raises TypeError for other records and methods, ValueError where a point was lit in fewer than two states, where a
     window holds no usable fibrelet, and for a folder of another call.
     """
-    one_of_types(
-        "calibration_fields", calibration_fields, (CalibrationFields,), "make them with retrieve_fields(calibration)."
-    )
     one_of_types("method", method, (RecoveryMethod,), "pass an object such as ForwardInverse().")
+    advice = "make them with retrieve_fields(calibration)."
+    if method.takes is Calibration:
+        advice = f"pass the calibration itself: {type(method).__name__} retrieves no fields."
+    one_of_types("calibration_fields", calibration_fields, (method.takes,), advice)
     return method.solve(calibration_fields, progress, folder)
 
 
