@@ -15,6 +15,7 @@ ALL = (
     "bundle",
     "images",
     "recovery",
+    "intensities",
     "peers",
     "chain",
     "parts",

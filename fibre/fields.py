@@ -32,7 +32,7 @@ from polinfer.checks import one_of_types
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
 
-__all__ = ["fibrelets_of", "retrieve_fields"]
+__all__ = ["fibrelets_of", "pattern_groups", "retrieve_fields"]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def retrieve_fields(
         reference = run.amplitudes(record.references, "reference")
         mean_reference = _mean_reference(reference)
         fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
-        groups = _groups(record)
+        groups = pattern_groups(record)
         for chosen, states in groups:
             fields.values[chosen] = fields.of(chosen).closed(mean_reference, states).values
         errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
@@ -278,7 +278,7 @@ def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> 
     return np.stack([squared, stated, power]).reshape(3, -1)
 
 
-def _groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:
+def pattern_groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:
     """Captures that light the same points with the same amplitudes but for the state, and their states (2, n)."""
     inputs = calibration.inputs.tocsc()
     count = len(calibration.points)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from fibre.calibration import Profile, profile_of_patterns
 from fibre.fibrelets import mode_matrix
-from fibre.fields import fibrelets_of, retrieve_fields
+from fibre.fields import fibrelets_of, pattern_groups, retrieve_fields
 from fibre.records import Calibration, CalibrationFields, Fibrelets, Images, Inverse
 from fibre.recovery.base import RecoveryMethod
 from fibre.recovery.forward_inverse import ForwardInverse
@@ -34,6 +34,9 @@ __all__ = ["IntensityOnly"]
 FOCUS = 2e-6  # metres: an image nearer to the focus than this is in focus
 CORE = 0.6  # of the mode's radius: pixels further out hold a neighbour's light too
 REACH = 1e-5  # of the coupling's peak: fainter points are left out
+MODEL = 0.01  # relative error of intensities that is not in the images' noise: shapes of modes, focus, pixels
+UNKNOWN = 0.01  # relative variance of a typical row beyond which it is not known
+SYNCHRONISE = 20  # times between the phases of fibrelets and those of captures
 FAINT = 1e-4  # of a neighbour's light: nothing
 REFERENCE = 0.03  # of the strongest: fibrelets with more of the reference spot's power carry no columns
 
@@ -57,10 +60,11 @@ class IntensityOnly(RecoveryMethod):
     Parameters
     ----------
     algorithm: of :func:`fibre.rows_from_intensities`. retrieval: None: ``Modal`` of the fibrelets. fibrelets: where
-    they are; None: found in the images. tie: patterns that are retrieved, >= 1. inverse: how the fields are inverted;
+    they are; None: found in the images. tie: patterns that are retrieved, >= 1, chosen to light all
+    fibrelets. inverse: how the fields are inverted;
     None: ``ForwardInverse()``.
 
-    Raises ValueError where no image is in focus, or the inputs are no random patterns.
+    Raises ValueError where no image is in focus, or where the inputs do not tell the rows.
 
     Source: the sources of :func:`fibre.rows_from_intensities`, used for a calibration as in Gordon et al. (2018), 8.
     """
@@ -68,7 +72,7 @@ class IntensityOnly(RecoveryMethod):
     algorithm: Algorithm = "variational"
     retrieval: RetrievalMethod | None = None
     fibrelets: Fibrelets | None = None
-    tie: int = 2
+    tie: int = 4
     inverse: ForwardInverse | None = None
 
     takes: ClassVar[type] = Calibration
@@ -90,7 +94,7 @@ class IntensityOnly(RecoveryMethod):
         optics = _Optics.of(fibrelets, calibration.images)
         seen, alone = optics.intensities(calibration.images), optics.intensities(calibration.references)
         work = _Work.of(calibration, fibrelets, optics, seen, alone, self.algorithm)
-        chosen = self._chosen(calibration)
+        chosen = self._chosen(calibration, seen)
         part = replace(
             calibration,
             images=_some(calibration.images, chosen),
@@ -108,18 +112,20 @@ class IntensityOnly(RecoveryMethod):
             calibration.points, calibration.grid, calibration.registration, status,
         )  # fmt: skip
 
-    def _chosen(self, calibration: Calibration) -> list[int]:
-        """Captures of the first ``tie`` patterns."""
-        inputs = calibration.inputs.tocsc()
+    def _chosen(self, calibration: Calibration, seen: _Seen) -> list[int]:
+        """Captures of ``tie`` patterns that together light every fibrelet, in order."""
+        groups = [captures for captures, _ in pattern_groups(calibration)]
+        light = np.stack([seen.values[captures].mean((0, 1)) for captures in groups])
+        share = light / np.maximum(light.mean(0), 1e-300)
+        told = np.zeros(share.shape[1])
         chosen: list[int] = []
-        patterns: list[tuple[int, ...]] = []
-        for capture in range(inputs.shape[1]):
-            lit = tuple(inputs.indices[inputs.indptr[capture] : inputs.indptr[capture + 1]] % len(calibration.points))
-            if lit not in patterns and len(patterns) < self.tie:
-                patterns.append(lit)
-            if lit in patterns:
-                chosen.append(capture)
-        return chosen
+        for _ in range(min(self.tie, len(groups))):
+            # the logarithm asks for light on fibrelets that are still dark
+            gains = np.log(told + share + 1e-3).sum(1)
+            gains[chosen] = -np.inf
+            chosen.append(int(np.argmax(gains)))
+            told += share[chosen[-1]]
+        return sorted(int(c) for pattern in chosen for c in groups[pattern])
 
 
 class _Fields(NamedTuple):
@@ -131,9 +137,13 @@ class _Fields(NamedTuple):
     chi_square: np.ndarray
 
     def tied(self, retrieved: CalibrationFields, chosen: list[int]) -> _Fields:
-        """Every fibrelet turned to the phase that it has in the retrieved captures."""
-        product = np.sum(np.conj(self.values[chosen]) * retrieved.fields / retrieved.variance, axis=(0, 1))
-        turn = np.exp(1j * np.angle(product))
+        """Every fibrelet turned to the phase that it has in the retrieved captures, whose pistons are their own."""
+        products = np.conj(self.values[chosen]) * retrieved.fields / retrieved.variance
+        products = products.sum(1)
+        piston = np.ones(len(chosen), complex)
+        for _ in range(SYNCHRONISE):
+            turn = np.exp(1j * np.angle(piston.conj() @ products))
+            piston = np.exp(1j * np.angle(products @ turn.conj()))
         return self._replace(values=self.values * turn, constant=self.constant * turn)
 
 
@@ -219,7 +229,7 @@ class _Work(NamedTuple):
         cls, calibration: Calibration, fibrelets: Fibrelets, optics: _Optics, seen: _Seen, alone: _Seen,
         algorithm: Algorithm,
     ) -> _Work:  # fmt: skip
-        """Raises ValueError where the inputs are no random patterns."""
+        """With the coupling profile of the inputs."""
         power = alone.values[:, 1:].mean((0, 1))
         usable = power <= REFERENCE * power.max()
         positions = calibration.points @ calibration.registration[:, :2].T + calibration.registration[:, 2]
@@ -241,7 +251,7 @@ class _Work(NamedTuple):
                 values[:, view] -= self.optics.crosstalk(mixed.T).T
         variance = self.seen.variance + excess
         fields, spread = np.zeros((len(values), 2, m), complex), np.full((len(values), 2, m), np.inf)
-        constant, chi_square = np.zeros((2, m), complex), np.full(m, np.nan)
+        constant, chi_square, unknown = np.zeros((2, m), complex), np.full(m, np.nan), np.full(m, np.nan)
         chosen = np.flatnonzero(self.usable)
         with (
             threadpool_limits(1, user_api="blas"),
@@ -250,8 +260,14 @@ class _Work(NamedTuple):
         ):
             tasks = pool.map(lambda k: self.fibrelet(k, values[:, :, k], variance[:, :, k]), chosen)
             for k, part in zip(chosen, tasks, strict=True):
-                fields[:, :, k], spread[:, :, k], constant[:, k], chi_square[k] = part
+                fields[:, :, k], spread[:, :, k], constant[:, k], chi_square[k], unknown[k] = part
                 bar.update()
+        if not np.nanmedian(unknown) < UNKNOWN:
+            raise ValueError(
+                "calibration does not tell the rows of the matrix: its intensities leave a relative variance of "
+                f"{np.nanmedian(unknown):.2g} in that of a typical fibrelet. Light several points within reach of each "
+                "at the same time, as a PatternPlan does, and take five times as many images as there are unknowns."
+            )
         return _Fields(fields, spread, constant, chi_square)
 
     def views(self, fields: np.ndarray) -> list[np.ndarray]:
@@ -260,21 +276,28 @@ class _Work(NamedTuple):
         return [fields[:, 0], *mixed]
 
     def unexplained(self, before: _Fields | None) -> np.ndarray:
-        """Variance of intensities by neighbours' light of unknown phase; a hundredth where it was taken off."""
+        """Variance of intensities by shapes that are not quite the modes', and by neighbours' light of unknown phase, a
+        hundredth of which is left where it was taken off."""
         squared = self.optics.leak.power(2)
         powers = np.maximum(self.seen.values, 0)
         cross = np.stack([2 * powers[:, v] * (squared @ powers[:, v].T).T for v in range(powers.shape[1])], 1)
-        return cross if before is None else 0.01 * cross
+        return (cross if before is None else 0.01 * cross) + (MODEL * powers) ** 2
 
     def fibrelet(
         self, k: int, values: np.ndarray, variance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """Fields (captures, 2), their variance, the constant (2,) and the reduced chi-square of one fibrelet."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
+        """Fields (captures, 2), their variance, the constant (2,), reduced chi-square, relative variance of the row."""
         away = np.hypot(*(self.positions - self.centres[k]).T)
         near = np.flatnonzero(away <= self.profile.reach(REACH))
         count, captures = len(self.positions), len(values)
         if len(near) == 0:
-            return np.zeros((captures, 2), complex), np.full((captures, 2), np.inf), np.zeros(2, complex), np.nan
+            return (
+                np.zeros((captures, 2), complex),
+                np.full((captures, 2), np.inf),
+                np.zeros(2, complex),
+                np.nan,
+                np.nan,
+            )
         x = np.concatenate([self.inputs[near], self.inputs[near + count], np.ones((1, captures))])
         n = len(x)
         x = np.concatenate([x, np.eye(n)[:, -1:]], axis=1)  # the reference alone, last
@@ -300,7 +323,9 @@ class _Work(NamedTuple):
         steps = told[:, 1:].sum(1) / 2
         known = np.stack([told[:, 0] + steps, steps], axis=1)
         stated = worse / np.maximum(known, 1e-300)
-        return fields, stated, np.array([a[-1], b[-1]]), float(found.chi_square[0])
+        power = float((np.abs(found.values) ** 2).sum())
+        unknown = float(found.variance.sum()) / max(power, 1e-300)
+        return fields, stated, np.array([a[-1], b[-1]]), float(found.chi_square[0]), unknown
 
 
 def _some(images: Images, chosen: list[int]) -> Images:

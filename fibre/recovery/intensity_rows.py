@@ -20,6 +20,7 @@ Algorithm = Literal["variational", "message_passing", "spectral"]
 
 CHUNK = 32  # rows at a time
 STAGE = 20  # iterations, at most, at one level of noise
+POLISH = 3  # Gauss-Newton steps at the end
 FAINT = 1e-12  # of the prior's variance: nothing
 COOL = 0.6  # factor of the noise from stage to stage, at least
 DAMPING = (0.3, 0.15)  # share of the new message, from try to try
@@ -37,9 +38,9 @@ class RowStatus(enum.IntFlag):
 
 
 class Rows(NamedTuple):
-    """values: complex (m, n), a phase of each row free. variance: (m, n), E|error|^2 apart from that phase, as the
-    algorithm believes. chi_square: (m,), misfit of the intensities per degree of freedom. status: (m,)
-    :class:`RowStatus`."""
+    """values: complex (m, n), a phase of each row free. variance: (m, n), E|error|^2 apart from that phase: by the
+    curvature (variational), as the messages have it (message passing), or the prior's (spectral). chi_square: (m,),
+    misfit of the intensities per degree of freedom. status: (m,) :class:`RowStatus`."""
 
     values: np.ndarray
     variance: np.ndarray
@@ -73,7 +74,8 @@ def rows_from_intensities(
               \mu = \Sigma X^* N^{-1} \bar y, \quad
               \bar y_c = \sqrt{I_c}\, R\!\left(\tfrac{2 \sqrt{I_c} |z_c|}{N_c}\right) \frac{z_c}{|z_c|},
 
-    R = I_1/I_0, with the noise falling from that of the first misfit to the stated one.
+    R = I_1/I_0, with the noise falling from that of the first misfit to the stated one. In the end Gauss-Newton steps
+    on the intensities with their own noise, and the variance from their curvature.
 
     ``message_passing``: generalised approximate message passing with the same measurements and sparse rows: a share
     :math:`\rho` of the elements is :math:`CN(0, \theta\tau_j^2)`, the others are 0, with :math:`\rho` and
@@ -117,9 +119,10 @@ def rows_from_intensities(
     n = x.shape[-2]
     spread = np.broadcast_to(np.asarray(variance, float), (m, count)) if np.ndim(variance) == 0 else variance
     spread = real_array("variance", spread, shape=(m, count), above=0).astype(float)
-    tau = np.ones(n) if prior is None else prior
-    tau = np.broadcast_to(np.asarray(tau, float), (m, n)) if np.ndim(tau) == 1 else tau
-    tau = real_array("prior", tau, shape=(m, n), low=0, finite=True).astype(float)
+    tau = real_array("prior", np.ones(n) if prior is None else prior, low=0, finite=True).astype(float)
+    if tau.shape not in ((n,), (m, n)):
+        raise ValueError(f"prior must have shape ({n},) or ({m}, {n}), got {tau.shape}.")
+    tau = np.broadcast_to(tau, (m, n))
     parts = []
     for start in range(0, m, CHUNK):
         rows = slice(start, min(start + CHUNK, m))
@@ -153,7 +156,7 @@ class _Problem(NamedTuple):
         intensity, spread = seen / size**2, spread / size**4
         amplitude = np.sqrt(np.maximum(intensity, 0))
         # radial noise of |z + n| is half of E|n|^2; near zero the intensity's noise is what moves the amplitude
-        noise = spread / (2 * np.maximum(intensity, np.sqrt(spread)))
+        noise = np.where(usable, spread, np.inf) / (2 * np.maximum(intensity, np.sqrt(np.where(usable, spread, 1))))
         # the prior's own scale: rows times inputs have unit mean square
         power = np.where(usable, (np.abs(moved) ** 2).sum(2), 0).sum(1, keepdims=True) / number
         scale = np.sqrt(np.maximum(power, 1e-300))
@@ -265,10 +268,47 @@ class _Problem(NamedTuple):
                 if np.all(change < (1e-6 if last else 1e-2)):
                     break
             if last:
-                variance = np.einsum("kii->ki", inverse).real
-                return _Found(rows, variance, change > 1e-3, (1 - variance).sum(1))
+                return self.polished(rows, change > 1e-3)
             extra = np.minimum(COOL * extra, self.misfit(rows))
             extra = np.where((extra < 0.1 * typical) | (spent > 0.7 * iterations), 0, extra)
+
+    def polished(self, rows: np.ndarray, moving: np.ndarray) -> _Found:
+        r"""Gauss-Newton steps of the intensities' own likelihood, and its curvature.
+
+        :math:`\delta I_c = 2\,\mathrm{Re}(z_c^* \, x_c \delta a)`; the row's phase, which changes nothing, is held.
+        """
+        usable = np.isfinite(self.spread)
+        weight = np.where(usable, 1 / np.where(usable, self.spread, 1), 0)
+        n = rows.shape[1]
+
+        def cost(rows: np.ndarray) -> np.ndarray:
+            left = self.intensity - np.abs(self.forward(rows)) ** 2
+            return np.asarray((weight * left**2).sum(1) + 2 * (np.abs(rows) ** 2).sum(1))
+
+        now = cost(rows)
+        for number in range(POLISH + 1):
+            z = self.forward(rows)
+            slope = z.conj()[..., None] * self.x
+            slope = np.concatenate([2 * slope.real, -2 * slope.imag], axis=2)
+            both = np.concatenate([rows.real, rows.imag], axis=1)
+            around = np.concatenate([-rows.imag, rows.real], axis=1)
+            around = around / np.maximum(np.linalg.norm(around, axis=1, keepdims=True), 1e-300)
+            system = np.matmul(slope.swapaxes(1, 2) * weight[:, None], slope) + 2 * np.eye(2 * n)
+            stiff = np.einsum("kii->ki", system).max(1)[:, None, None]
+            system = system + stiff * around[:, :, None] * around[:, None, :]
+            covariance = np.linalg.inv(system)
+            if number == POLISH:
+                break
+            left = weight * (self.intensity - np.abs(z) ** 2)
+            gradient = (slope.swapaxes(1, 2) @ left[..., None])[..., 0] - 2 * both
+            step = (covariance @ gradient[..., None])[..., 0]
+            new = rows + step[:, :n] + 1j * step[:, n:]
+            then = cost(new)
+            better = then < now
+            rows, now = np.where(better[:, None], new, rows), np.where(better, then, now)
+        spread = np.einsum("kii->ki", covariance)
+        variance = np.maximum(spread[:, :n] + spread[:, n:], 0)
+        return _Found(rows, variance, moving, (1 - np.minimum(variance, 1)).sum(1))
 
     def message_passing(self, rows: np.ndarray, iterations: int, damping: float) -> _Found:
         """Messages between intensities and elements, each mean and variance; the state that misfits least."""

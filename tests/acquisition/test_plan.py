@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acquisition import Bracket, CalibrationPlan, SamplePlan, Timing, Views, elliptical_states
+from acquisition import Bracket, CalibrationPlan, PatternPlan, SamplePlan, Timing, Views, elliptical_states
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 7])
@@ -154,3 +154,25 @@ def test_a_sample_plan_has_sample_and_blank_in_every_state():
 def test_wrong_settings_are_named(call, error, text):
     with pytest.raises(error, match=text):
         call()
+
+
+def test_patterns_are_lit_in_every_state_and_follow_the_seed():
+    plan = PatternPlan((4, 6), patterns=5, share=0.4, seed=3)
+    inputs = plan.inputs.toarray().reshape(2, 24, 5, 3)
+    lit = np.abs(inputs) > 0
+    assert np.all(lit == lit[:1, :, :, :1])
+    assert np.all(lit[0, :, :, 0].sum(0) == 10)
+    # the field at every point is a phase times the state
+    phases = inputs[0] / plan.illumination[0]
+    np.testing.assert_allclose(np.abs(phases[lit[0]]), 1)
+    np.testing.assert_allclose(inputs[1], phases * plan.illumination[1])
+    np.testing.assert_allclose(phases, np.repeat(phases[..., :1], 3, 2))
+    assert plan.hash == PatternPlan((4, 6), patterns=5, share=0.4, seed=3).hash
+    assert plan.hash != PatternPlan((4, 6), patterns=5, share=0.4, seed=4).hash
+    assert [step.kind for step in plan.captures[:2]] == ["reference", "spots"]
+
+
+@pytest.mark.parametrize(("change", "text"), [({"share": 1.5}, "share must be <= 1"), ({"patterns": 0}, "patterns")])
+def test_wrong_settings_of_patterns_are_named(change, text):
+    with pytest.raises(ValueError, match=text):
+        PatternPlan(**change)

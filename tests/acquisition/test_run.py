@@ -247,7 +247,7 @@ def test_a_sample_run_has_one_capture_per_state_with_and_without_the_sample(tmp_
 @pytest.mark.parametrize(
     ("call", "error", "text"),
     [
-        (lambda folder: calibrate(bench(), SAMPLE, folder), TypeError, "plan must be CalibrationPlan"),
+        (lambda folder: calibrate(bench(), SAMPLE, folder), TypeError, "plan must be GridPlan.*pass CalibrationPlan"),
         (lambda folder: capture(bench(), PLAN, folder), TypeError, "plan must be SamplePlan"),
         (lambda folder: capture(bench(), SamplePlan(blank=False), folder), ValueError, "plan must have a blank"),
         (lambda folder: capture(bench(), SamplePlan(references=0), folder), ValueError, "plan must have a blank"),
