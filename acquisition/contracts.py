@@ -37,3 +37,6 @@ class Bench(Protocol):
 
     def time(self) -> float:
         """Seconds on a monotonic clock."""
+
+    def continue_from(self, seconds: float) -> None:
+        """A run that is resumed was at this time when it was cut off: the clock goes on from there, not before it."""

@@ -259,7 +259,11 @@ class PatternPlan(GridPlan):
 
 @dataclass(frozen=True)
 class SamplePlan(Plan):
-    """The sample in every state, with captures of the reference spot and (``blank``) of the scene without a sample."""
+    """The sample in every state, with captures of the reference spot and (``blank``) of the scene without a sample.
+
+    References are spread evenly, the first before everything else, the last after it (a single one before): drift is
+    interpolated between them.
+    """
 
     states: int = 3
     blank: bool = True
@@ -275,8 +279,11 @@ class SamplePlan(Plan):
     @cached_property
     def captures(self) -> tuple[Step, ...]:
         """See :class:`Plan`."""
-        steps = [Step(f"reference-{i}", "reference") for i in range(self.references)]
+        steps = []
         if self.blank:
             steps += [Step(f"blank-state-{state}", "blank", (), state) for state in range(self.states)]
         steps += [Step(f"sample-state-{state}", "sample", (), state) for state in range(self.states)]
+        before = np.round(np.linspace(0, len(steps), self.references)).astype(int) if self.references > 1 else [0]
+        for i in reversed(range(self.references)):
+            steps.insert(int(before[i]), Step(f"reference-{i}", "reference"))
         return tuple(steps)

@@ -55,7 +55,7 @@ class Folder:
             lines = [json.loads(line) for line in whole.splitlines()]
         except ValueError as error:  # not JSON, or not even text
             raise ValueError(f"folder {self.path} has a damaged {MANIFEST} ({error}); it cannot be resumed.") from error
-        parts = {"id", "bytes", "sha256", "exposures", "time"}
+        parts = {"id", "bytes", "sha256", "exposures", "time", "ended"}
         if not all(isinstance(line, dict) for line in lines) or any(not parts <= line.keys() for line in lines[1:]):
             raise ValueError(f"folder {self.path} has a foreign {MANIFEST}; choose another folder.")
         return lines
@@ -74,8 +74,10 @@ class Folder:
         finally:
             os.close(descriptor)
 
-    def store(self, identity: str, frames: list[np.ndarray], exposures: list[list[float]], time: float) -> None:
-        """Keep one capture: ``frames[i]`` are the raw exposures (k, y, x) of image i."""
+    def store(
+        self, identity: str, frames: list[np.ndarray], exposures: list[list[float]], time: float, ended: float
+    ) -> None:
+        """Keep a capture from ``time`` to ``ended``: ``frames[i]`` are the raw exposures (k, y, x) of image i."""
         name = f"{identity}.npz"
         part = self.path / f".{name}.part"
         with open(part, "wb") as file:
@@ -87,7 +89,8 @@ class Folder:
         size = part.stat().st_size
         os.replace(part, self.path / name)
         self._sync_directory()
-        line = {"id": identity, "file": name, "bytes": size, "sha256": digest, "exposures": exposures, "time": time}
+        line = {"id": identity, "file": name, "bytes": size, "sha256": digest, "exposures": exposures, "time": time,
+                "ended": ended}  # fmt: skip
         self._append(line)
         self.done[identity] = line
 

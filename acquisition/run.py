@@ -59,6 +59,7 @@ def _execute(bench: Bench, plan: Plan, folder: str | Path, points: np.ndarray | 
     store = Folder(folder, {"plan": plan.hash, "bench": bench.describe()})
     for step in tqdm(plan.captures, desc=type(plan).__name__, unit="capture", disable=not progress):
         if store.complete(step.id):
+            bench.continue_from(store.done[step.id]["ended"])
             continue
         bench.prepare(step, plan.views, plan.illumination, points)
         started = bench.time()
@@ -72,7 +73,7 @@ def _execute(bench: Bench, plan: Plan, folder: str | Path, points: np.ndarray | 
                     break
             frames.append(np.stack(stack))
             exposures.append(times)
-        store.store(step.id, frames, exposures, started)
+        store.store(step.id, frames, exposures, started, bench.time())
     return store
 
 

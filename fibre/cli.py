@@ -34,10 +34,18 @@ def _load(path: Path, kinds: tuple[type, ...]) -> Any:
 )
 @click.option("--iterations", type=int, default=150, show_default=True, help="Most sweeps; modal does not need them.")
 @click.option("--fibrelets", type=_PATH, help="Calibration fields whose fibrelets to use; needed for a recording.")
+@click.option("--track-drift", is_flag=True, help="Follow the tilt of the fibre's light, and take it out.")
 @click.option("--resume", "folder", type=_PATH, help="Keep finished captures in this folder, and go on from there.")
 @click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
 def retrieve_command(
-    record: Path, out: Path, method: str, iterations: int, fibrelets: Path | None, folder: Path | None, overwrite: bool
+    record: Path,
+    out: Path,
+    method: str,
+    iterations: int,
+    fibrelets: Path | None,
+    track_drift: bool,
+    folder: Path | None,
+    overwrite: bool,
 ) -> None:
     """Fields of every capture of RECORD (a Calibration or a Recording), written to OUT.
 
@@ -59,16 +67,18 @@ def retrieve_command(
     from fibre.fields import fibrelets_of
 
     data = _load(record, (Calibration, Recording))
-    known = None if fibrelets is None else _load(fibrelets, (CalibrationFields,)).fibrelets
+    known: Any = None if fibrelets is None else _load(fibrelets, (CalibrationFields,))
     if method == "modal":
         if known is None and isinstance(data, Calibration):
             known = fibrelets_of(data)
         if known is None:
             raise click.UsageError("fibrelets must be given for a Recording; pass --fibrelets calibration-fields.nc.")
-        chosen: Any = Modal(known)
+        chosen: Any = Modal(known.fibrelets if isinstance(known, CalibrationFields) else known)
     else:
         chosen = {"gerchberg-saxton": GerchbergSaxton, "accelerated": Accelerated}[method](iterations=iterations)
-    fields = retrieve_fields(data, chosen, fibrelets=known, progress=True, folder=folder)
+    fields = retrieve_fields(
+        data, chosen, fibrelets=known, progress=True, drift="track" if track_drift else None, folder=folder
+    )
     click.echo(f"wrote {save(fields, out, overwrite=overwrite)}")
     parts = [fields.status] + ([fields.blank_status] if isinstance(fields, RecordingFields) else [])
     status = np.concatenate(parts)

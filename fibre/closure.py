@@ -14,7 +14,7 @@ import scipy.optimize
 
 from polinfer.checks import complex_array, real_array
 
-__all__ = ["NoiseScale", "closure_errors", "closure_phases", "noise_scale"]
+__all__ = ["NoiseScale", "closure_errors", "closure_phases", "closure_tilts", "noise_scale"]
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,50 @@ def closure_phases(fields: np.ndarray, variance: np.ndarray, states: np.ndarray,
     phases = np.angle(turn / turn[0])
     # only differences of phase are seen: keep the captures, on average, where the reference put them
     return phases - phases.mean()
+
+
+def closure_tilts(
+    fields: np.ndarray, variance: np.ndarray, states: np.ndarray, centres: np.ndarray, steps: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Pistons (n,), radians, and tilts (n, 2), radians a metre, that make n captures close best; means of 0.
+
+    As :func:`closure_phases` with the phase :math:`\phi_k + g_k \cdot r`, r = ``centres`` (m, 2) less their mean, by
+    Gauss-Newton steps from the pistons alone: what a fibre's beam moves between captures a minute's reference cannot
+    follow. ``fields`` (n, ..., m). All 0 with fewer than three states.
+
+    >>> states = np.array([[1, 1, 1], [1, 1j, -1]])
+    >>> centres = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    >>> centres -= centres.mean(0)
+    >>> tilts = np.array([[0.1, 0.0], [0.0, 0.2], [-0.1, -0.2]])
+    >>> clean = np.einsum("an,am->nm", states, np.random.default_rng(1).normal(size=(2, 50)))
+    >>> turned = np.exp(1j * tilts @ centres.T) * clean
+    >>> found = closure_tilts(turned, np.ones((3, 50)), states, centres)[1]
+    >>> bool(np.allclose(found, -tilts, atol=1e-6))
+    True
+    """
+    phases = closure_phases(fields, variance, states)
+    count = len(phases)
+    tilts = np.zeros((count, 2))
+    place = centres - centres.mean(0)
+    size = float(np.sqrt((place**2).sum(1).mean()))
+    if count < 3 or not size > 0:
+        return phases, tilts
+    null = scipy.linalg.null_space(np.asarray(states))
+    flat = np.asarray(fields).reshape(count, -1, len(place))
+    root = 1 / np.sqrt(np.asarray(variance).reshape(flat.shape).mean(0))
+    design = np.concatenate([np.ones((len(place), 1)), place / size], axis=1)
+    found = np.concatenate([phases[:, None], tilts], axis=1)
+    for _ in range(steps):
+        turned = flat * np.exp(1j * found @ design.T)[:, None] * root
+        left = np.einsum("kc,kqm->cqm", null, turned).ravel()
+        slopes = 1j * np.einsum("kc,kqm,mj->cqmkj", null, turned, design).reshape(len(left), -1)
+        # the same ramp on all captures changes nothing: of all solutions the smallest
+        change = np.linalg.lstsq(
+            np.concatenate([slopes.real, slopes.imag]), -np.concatenate([left.real, left.imag]), rcond=1e-8
+        )[0]
+        found = found + change.reshape(count, 3)
+        found -= found.mean(0)
+    return found[:, 0], found[:, 1:] / size
 
 
 def noise_scale(errors: np.ndarray) -> NoiseScale:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
+from typing import Literal, overload
 
 import numpy as np
 from tqdm import tqdm
 
-from fibre.closure import closure_errors, closure_phases, noise_scale
-from fibre.drift import Drift
+from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_scale
+from fibre.drift import Drift, track_drift
 from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
@@ -57,11 +57,16 @@ class _Amplitudes:
         """Every capture turned by its phase, radians."""
         return replace(self, values=self.values * np.exp(1j * phases)[:, None, None])
 
-    def closed(self, reference: np.ndarray, states: np.ndarray) -> _Amplitudes:
-        """Captures of one scene in several states, turned so that the states close best."""
+    def closed(self, reference: np.ndarray, states: np.ndarray, fibrelets: Fibrelets | None) -> _Amplitudes:
+        """Captures of one scene in several states, turned so that they close best; with ``fibrelets`` tilted too."""
         outside = ~_reference_region(reference)
-        phases = closure_phases((self.values - reference)[..., outside], self.variance[..., outside], states)
-        return self.turned(phases)
+        fields, variance = (self.values - reference)[..., outside], self.variance[..., outside]
+        if fibrelets is None:
+            return self.turned(closure_phases(fields, variance, states))
+        middle = fibrelets.centres[outside].mean(0)
+        pistons, tilts = closure_tilts(fields, variance, states, fibrelets.centres[outside])
+        phase = pistons[:, None] + tilts @ (fibrelets.centres - middle).T
+        return replace(self, values=self.values * np.exp(1j * phase)[:, None])
 
 
 def _mean_reference(reference: _Amplitudes) -> np.ndarray:
@@ -85,26 +90,26 @@ def _reference_region(reference: np.ndarray) -> np.ndarray:
 def retrieve_fields(
     record: Calibration,
     method: RetrievalMethod,
-    fibrelets: Fibrelets | None = None,
+    fibrelets: Fibrelets | CalibrationFields | None = None,
     progress: bool = False,
-    drift: Drift | None = None,
+    drift: Drift | Literal["track"] | None = None,
     folder: str | Path | None = None,
 ) -> CalibrationFields: ...
 @overload
 def retrieve_fields(
     record: Recording,
     method: RetrievalMethod,
-    fibrelets: Fibrelets | None = None,
+    fibrelets: Fibrelets | CalibrationFields | None = None,
     progress: bool = False,
-    drift: Drift | None = None,
+    drift: Drift | Literal["track"] | None = None,
     folder: str | Path | None = None,
 ) -> RecordingFields: ...
 def retrieve_fields(
     record: Calibration | Recording,
     method: RetrievalMethod,
-    fibrelets: Fibrelets | None = None,
+    fibrelets: Fibrelets | CalibrationFields | None = None,
     progress: bool = False,
-    drift: Drift | None = None,
+    drift: Drift | Literal["track"] | None = None,
     folder: str | Path | None = None,
 ) -> CalibrationFields | RecordingFields:
     r"""Fields of every capture, in fibrelet modes, with variance.
@@ -124,31 +129,40 @@ def retrieve_fields(
     Parameters
     ----------
     record: a Calibration or a Recording. method: for instance ``GerchbergSaxton()``. fibrelets: where the fibrelets
-    are; a calibration finds them in its own images (None), a recording must be given its calibration's. progress:
+    are; a calibration finds them in its own images (None), a recording must be given its calibration's, or the
+    CalibrationFields themselves. progress:
     show a bar. drift: piston and tilt against time (:func:`fibre.track_drift`), taken out of every capture and
-    reference at its time, and counted in the variance; the reference spot sets the piston in any case, so that it is
-    the tilt that this is for. None: the fibre holds still but for pistons. folder: where the amplitudes of finished
-    captures are kept (made if absent), so that the same call goes on where it was interrupted; None: nowhere. The
-    folder belongs to one method, set of fibrelets and record, which is known by its shape, times and settings and by
-    the images of its first and last capture.
+    reference at its time; with two states its uncertainty is counted in the variance, with more their closure measures
+    what is left of it. The reference spot sets the piston in any case, so that it is
+    the tilt that this is for. "track": followed through the record's own references, of a recording against the
+    reference of its calibration, which ``fibrelets`` must then be; what it does between two states of one scene their
+    closure tells (:func:`fibre.closure.closure_tilts`). None: the fibre holds still but for pistons.
+    folder: where the amplitudes of finished captures are kept (made if absent), so that the same call goes on where it
+    was interrupted; None: nowhere. The folder belongs to one method, set of fibrelets and record, which is known by its
+    shape, times and settings and by the images of its first and last capture.
 
     Raises
     ------
     TypeError, ValueError: a record of another kind; a recording without ``fibrelets``; a folder of another call.
     """
     one_of_types("record", record, (Calibration, Recording), "pass a Calibration or a Recording.")
-    if drift is not None:
-        one_of_types("drift", drift, (Drift,), "make one with track_drift.")
+    if drift is not None and drift != "track":
+        one_of_types("drift", drift, (Drift,), 'make one with track_drift, or pass "track".')
+    anchor, tracked = None, isinstance(drift, str)
+    if isinstance(fibrelets, CalibrationFields):
+        anchor = fibrelets.reference
+        fibrelets = fibrelets.fibrelets
     if isinstance(record, Calibration):
         if fibrelets is None:
             fibrelets = fibrelets_of(record)
-        run = _Run(method, fibrelets, progress, drift, folder)
-        reference = run.amplitudes(record.references, "reference")
+        run, reference = _Run(method, fibrelets, progress, None, folder, _closes(record)).following(
+            drift, record.references, anchor
+        )
         mean_reference = _mean_reference(reference)
         fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
-        groups = pattern_groups(record)
+        groups, tilting = pattern_groups(record), fibrelets if tracked else None
         for chosen, states in groups:
-            fields.values[chosen] = fields.of(chosen).closed(mean_reference, states).values
+            fields.values[chosen] = fields.of(chosen).closed(mean_reference, states, tilting).values
         errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
         noise = noise_scale(np.concatenate([np.empty((3, 0)), *errors], axis=1))
         return CalibrationFields(
@@ -166,12 +180,16 @@ def retrieve_fields(
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
-    run = _Run(method, fibrelets, progress, drift, folder)
-    reference = run.amplitudes(record.references, "reference")
+    if drift == "track" and anchor is None:
+        raise ValueError("fibrelets must be the CalibrationFields where the drift of a Recording is to be tracked.")
+    run, reference = _Run(method, fibrelets, progress, None, folder, record.illumination.shape[1] > 2).following(
+        drift, record.references, anchor
+    )
     mean_reference = _mean_reference(reference)
     fields = run.amplitudes(record.images, "sample").in_phase_with(mean_reference)
     blank = run.amplitudes(record.blank, "blank").in_phase_with(mean_reference)
-    fields, blank = (part.closed(mean_reference, record.illumination) for part in (fields, blank))
+    tilting = fibrelets if tracked else None
+    fields, blank = (part.closed(mean_reference, record.illumination, tilting) for part in (fields, blank))
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
     noise = noise_scale(np.concatenate(errors, axis=1))
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
@@ -189,6 +207,33 @@ def retrieve_fields(
     )
 
 
+def _closes(calibration: Calibration) -> bool:
+    """Whether most captures are one of three states or more of the same pattern."""
+    sizes = [states.shape[1] for _, states in pattern_groups(calibration)]
+    return sum(size for size in sizes if size > 2) > 0.5 * sum(sizes)
+
+
+def tracked_drift(references: np.ndarray, times: np.ndarray, fibrelets: Fibrelets, anchor: np.ndarray | None) -> Drift:
+    """The drift of reference fields (n, 2, m), relative to their mean or to ``anchor`` (2, m)."""
+    if len(references) < 2:
+        raise ValueError(f"references must be two or more where their drift is tracked, got {len(references)}.")
+    rates = None
+    if len(references) == 2:
+        # two alone do not tell how fast it goes: between exact ends any walk is a straight line
+        apart = track_drift(references, times, fibrelets)
+        span = float(np.ptp(times))
+        rates = (float(np.ptp(apart.piston) ** 2) / span, float((np.ptp(apart.tilt, axis=0) ** 2).mean()) / span)
+    drift = track_drift(references, times, fibrelets, rates=rates)
+    if anchor is None:
+        return drift
+    still = drift.correct(references, times, fibrelets).mean(0)
+    moved = track_drift(np.stack([anchor, still]), [0.0, 1.0], fibrelets)
+    # both about their own centres: the piston is that at the centre of this record's references
+    tilt = moved.tilt[1] - moved.tilt[0]
+    piston = moved.piston[1] - moved.piston[0] + tilt @ (drift.centre - moved.centre)
+    return replace(drift, piston=drift.piston + piston, tilt=drift.tilt + tilt)
+
+
 def fibrelets_of(calibration: Calibration) -> Fibrelets:
     """Fibrelets in the sum of all interference images: every capture lights others, and incoherent sums are even."""
     images = calibration.images
@@ -201,13 +246,14 @@ def fibrelets_of(calibration: Calibration) -> Fibrelets:
 
 @dataclass(frozen=True)
 class _Run:
-    """The settings of one call."""
+    """The settings of one call. closes: three states or more, whose closure measures what the drift leaves over."""
 
     method: RetrievalMethod
     fibrelets: Fibrelets
     progress: bool = False
     drift: Drift | None = None
     folder: str | Path | None = None
+    closes: bool = True
     batch: int = 8
 
     def amplitudes(self, images: Images, name: str) -> _Amplitudes:
@@ -226,11 +272,31 @@ class _Run:
                 done.append(found)
                 bar.update(len(part))
         whole = _Amplitudes(*(np.concatenate([getattr(d, f) for d in done]) for f in ("values", "variance", "status")))
+        return self._corrected(whole, images.times)
+
+    def _corrected(self, whole: _Amplitudes, times: np.ndarray) -> _Amplitudes:
         if self.drift is None:
             return whole
-        values = self.drift.correct(whole.values, images.times, self.fibrelets)
-        spread = self.drift.phase_variance(images.times, self.fibrelets)[:, None]
+        values = self.drift.correct(whole.values, times, self.fibrelets)
+        if self.closes:
+            return replace(whole, values=values)
+        spread = self.drift.phase_variance(times, self.fibrelets)[:, None]
         return replace(whole, values=values, variance=whole.variance + np.abs(values) ** 2 * spread)
+
+    def following(
+        self, drift: Drift | str | None, references: Images, anchor: np.ndarray | None
+    ) -> tuple[_Run, _Amplitudes]:
+        """The run that takes the drift out, and the references without it.
+
+        A drift that is tracked is that of the references, and against ``anchor``, complex (2, m), if there is one.
+        """
+        if not isinstance(drift, str):
+            run = replace(self, drift=drift)
+            return run, run.amplitudes(references, "reference")
+        found = self.amplitudes(references, "reference")
+        tracked = tracked_drift(found.values, references.times, self.fibrelets, anchor)
+        run = replace(self, drift=tracked)
+        return run, run._corrected(found, references.times)
 
     def _kept(self, images: Images, name: str) -> Kept:
         ends = tuple(np.asarray(images.radiance[c]) for c in (0, images.captures - 1))

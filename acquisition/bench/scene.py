@@ -52,6 +52,10 @@ class Scene:
     focus_offset, metres; step_error, radians (standard deviation of the phase steps); oversampling, samples of the
     camera field per pixel and axis; sample_oversampling, points of the sample per distal point and axis (1: the
     sample's field lies in the span of the calibration).
+
+    Drift, absent by default: piston_walk, rad/sqrt(s), and tilt_walk, rad/m/sqrt(s) for each axis, of random walks of
+    the phase at the camera and of its slope over the facet, held still during a capture; image_time, seconds of an
+    image beyond its exposures (the paper's 8.3 s a capture: 0.75), in which the fibre walks.
     """
 
     bundle: Bundle
@@ -69,13 +73,16 @@ class Scene:
     step_error: float = 0.0
     oversampling: int = 1
     sample_oversampling: int = 1
+    piston_walk: float = 0.0
+    tilt_walk: float = 0.0
+    image_time: float = 0.0
 
     def __post_init__(self) -> None:
         one_of_types("bundle", self.bundle, (Bundle,), "for instance Bundle.hexagonal().")
         one_of_types("phantom", self.phantom, (Phantom,), "for instance phantoms.lesion((18, 18)).")
         for name in ("pitch", "spot_power", "spot_waist", "illumination_waist"):
             real_number(name, getattr(self, name), above=0)
-        for name in ("illumination", "reference_amplitude", "step_error"):
+        for name in ("illumination", "reference_amplitude", "step_error", "piston_walk", "tilt_walk", "image_time"):
             real_number(name, getattr(self, name), low=0)
         if np.ndim(self.phantom.parameters.retardance) != 2:
             raise ValueError("phantom must be a frame (y, x); give its parameters two axes.")

@@ -18,12 +18,14 @@ from polinfer.checks import as_generator, one_of_types
 
 __all__ = ["SimulatedBench"]
 
+WALK = 1  # the seed of the drift, beside the bench's own
+
 
 class SimulatedBench:
     """The bench of a :class:`Scene`: hologram -> sample -> bundle -> second modulator -> camera.
 
-    Frames depend on (seed, step, view, exposure) only, so an interrupted run that is resumed sees the same frames.
-    Light meets the retarder of the phantom first.
+    Frames depend on (seed, step, view, exposure) and, through the drift if there is one, on the time, so an interrupted
+    run that is resumed sees the same frames. Light meets the retarder of the phantom first.
     """
 
     def __init__(self, scene: Scene, rng: int | np.random.Generator | None = None) -> None:
@@ -38,7 +40,7 @@ class SimulatedBench:
         self.registration = np.array([[1.0, 0, 0], [0, 1.0, 0]])
         self._step: Step | None = None
         self._rates: np.ndarray | None = None
-        self._clock = 0.0
+        self._clock, self._view = 0.0, -1
         self._sample = self._sample_field()
 
     def describe(self) -> dict[str, Any]:
@@ -62,8 +64,22 @@ class SimulatedBench:
         return json.loads(json.dumps(described | {"camera": asdict(self.scene.camera)}))
 
     def time(self) -> float:
-        """Seconds; the simulated clock advances by each exposure."""
+        """Seconds; the simulated clock advances by each exposure, and by the scene's time for each image."""
         return self._clock
+
+    def continue_from(self, seconds: float) -> None:
+        """See :class:`acquisition.contracts.Bench`."""
+        self._clock = max(self._clock, seconds)
+
+    def drift(self, seconds: float) -> tuple[float, tuple[float, float]]:
+        """Piston, radians, and tilt, radians a metre along (row, column), at a time: random walks of the seed."""
+        scene = self.scene
+        if scene.piston_walk == 0 and scene.tilt_walk == 0:
+            return 0.0, (0.0, 0.0)
+        whole = int(seconds)
+        steps = np.random.default_rng([self.seed, WALK]).standard_normal((whole + 1, 3))
+        walk = steps[:whole].sum(0) + np.sqrt(seconds - whole) * steps[whole]
+        return float(scene.piston_walk * walk[0]), (float(scene.tilt_walk * walk[1]), float(scene.tilt_walk * walk[2]))
 
     def prepare(self, step: Step, views: Views, illumination: np.ndarray, points: np.ndarray | None) -> None:
         """See :class:`acquisition.contracts.Bench`."""
@@ -81,15 +97,18 @@ class SimulatedBench:
             places, light, jones, waist = self._sample[1:]
             field = light[:, None] * state if step.kind == "blank" else light[:, None] * (jones @ state)
             launched += (scene.bundle.launch(places, waist) @ field).T
-        self._rates = self._views(scene.bundle.transmit(launched), views, step)
-        self._step = step
+        piston, tilt = self.drift(self._clock)
+        turned = np.exp(1j * (piston + scene.bundle.centres @ tilt))
+        self._rates = self._views(scene.bundle.transmit(launched) * turned, views, step)
+        self._step, self._view = step, -1
 
     def expose(self, view: int, exposure: float) -> np.ndarray:
         """See :class:`acquisition.contracts.Bench`."""
         if self._rates is None or self._step is None:
             raise RuntimeError("prepare a step before exposing.")
         camera = self.scene.camera
-        self._clock += exposure
+        self._clock += exposure + (self.scene.image_time if view != self._view else 0.0)
+        self._view = view
         mean = self._rates[view] * exposure
         key = hashlib.sha256(f"{self._step.id}|{view}|{exposure!r}".encode()).digest()
         generator = np.random.default_rng([self.seed, *np.frombuffer(key, np.uint32).tolist()])

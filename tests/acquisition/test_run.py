@@ -2,14 +2,15 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from acquisition import CalibrationPlan, SamplePlan, calibrate, capture, merge_exposures
+from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, calibrate, capture, merge_exposures
 from acquisition.recording import Folder
 from fibre import Calibration, Recording
-from tests.acquisition.benches import PLAN, SAMPLE, VIEWS, bench
+from tests.acquisition.benches import PLAN, SAMPLE, SCENE, VIEWS, bench
 
 
 class Interrupted(Exception):
@@ -84,6 +85,17 @@ def test_an_interrupted_run_resumes_with_the_same_bytes_and_takes_nothing_twice(
     assert len(first.exposed) + len(second.exposed) <= len(exposed) + 3 * len(VIEWS)
     np.testing.assert_array_equal(np.asarray(resumed.images.radiance), np.asarray(record.images.radiance))
     np.testing.assert_array_equal(resumed.images.times.shape, record.images.times.shape)
+
+
+def test_a_resumed_run_meets_the_drift_that_it_would_have_met(tmp_path):
+    moving = replace(SCENE, piston_walk=0.3, tilt_walk=2e4, image_time=1.0)
+    whole = calibrate(SimulatedBench(moving, rng=1), PLAN, tmp_path / "whole")
+    with pytest.raises(Interrupted):
+        calibrate(Flaky(SimulatedBench(moving, rng=1), limit=40), PLAN, tmp_path / "parts")
+    parts = calibrate(SimulatedBench(moving, rng=1), PLAN, tmp_path / "parts")
+    assert raw_files(tmp_path / "parts") == raw_files(tmp_path / "whole")
+    np.testing.assert_array_equal(parts.images.times, whole.images.times)
+    assert np.all(np.diff(whole.images.times) > len(VIEWS))
 
 
 def test_many_interruptions_are_survived(whole, tmp_path):
@@ -183,7 +195,7 @@ def test_a_foreign_manifest_is_refused_and_names_the_folder(content, tmp_path):
 def test_a_manifest_line_that_lacks_a_part_is_refused(whole, tmp_path):
     manifest = copy(whole, tmp_path)
     lines = manifest.read_text().splitlines()
-    for missing in ("bytes", "sha256", "exposures", "time"):
+    for missing in ("bytes", "sha256", "exposures", "time", "ended"):
         line = json.loads(lines[3])
         del line[missing]
         manifest.write_text("\n".join([*lines[:3], json.dumps(line), *lines[4:]]) + "\n")
@@ -210,7 +222,7 @@ def test_an_object_array_in_a_raw_file_is_not_unpickled(tmp_path):
     np.savez(tmp_path / "step.npz", image_000=np.array([Bomb()], dtype=object))
     raw = (tmp_path / "step.npz").read_bytes()
     line = {"id": "step", "file": "step.npz", "bytes": len(raw), "sha256": hashlib.sha256(raw).hexdigest(),
-            "exposures": [[0.1]], "time": 0.0}  # fmt: skip
+            "exposures": [[0.1]], "time": 0.0, "ended": 0.1}  # fmt: skip
     folder._append(line)
     again = Folder(tmp_path, header)
     assert again.complete("step")

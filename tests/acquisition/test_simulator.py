@@ -163,6 +163,37 @@ def test_the_bench_keeps_the_contract_and_describes_itself_in_json():
         b.prepare(SPOTS, VIEWS, PLAN.illumination, None)
 
 
+def test_drift_turns_and_tilts_the_light_by_a_walk_of_the_stated_rate():
+    still, moving = bench(), bench(piston_walk=0.2, tilt_walk=500.0, image_time=2.0)
+    assert still.drift(100.0) == (0.0, (0.0, 0.0))
+    # intensities of H in focus know of neither, those of H against V neither: both polarisations turn alike
+    before = moving.time()
+    np.testing.assert_array_equal(frame(moving, view=0, exposure=0.01), frame(still, view=0, exposure=0.01))
+    assert moving.time() == pytest.approx(before + 2.01)
+    assert moving.drift(300.0) == bench(piston_walk=0.2, tilt_walk=500.0).drift(300.0)
+    walks = [bench(piston_walk=0.2, tilt_walk=500.0, seed=seed) for seed in range(60)]
+    ends = np.array([(w.drift(130.5)[0], *w.drift(130.5)[1]) for w in walks])
+    starts = np.array([(w.drift(30.25)[0], *w.drift(30.25)[1]) for w in walks])
+    rate = ((ends - starts) ** 2).mean(0) / 100.25
+    # chi-square of 60: within 3 sigma
+    np.testing.assert_allclose(rate / np.array([0.2, 500, 500]) ** 2, 1, atol=3 * np.sqrt(2 / 60))
+
+
+def test_drift_is_a_ramp_of_the_phase_over_the_camera():
+    b = bench(camera=IDEAL, piston_walk=0.2, tilt_walk=1e3)
+    b.continue_from(80.0)
+    piston, tilt = b.drift(80.0)
+    b.prepare(SPOTS, VIEWS, PLAN.illumination, PLAN.points)
+    ramp = np.exp(1j * (piston + BUNDLE.centres @ tilt))
+    assert np.ptp(BUNDLE.centres @ tilt) > 0.1
+    proximal = (BUNDLE.transfer @ distal(SPOTS).ravel()).reshape(2, -1) * ramp
+    seen = np.abs(BUNDLE.image(proximal, (64, 64), CAMERA.pixel_size, VIEWS.diversity)[:, 0]) ** 2
+    rate = SCENE.spot_power * CAMERA.pixel_size**2
+    for view, intensity in enumerate(seen):
+        exposure = 500 / (rate * intensity.max())
+        assert np.abs(b.expose(view, exposure) * 1e-2 - rate * intensity * exposure).max() <= 0.005 + 1e-4 * 500
+
+
 OTHERS = {
     "seed": lambda: bench(seed=8),
     "camera": lambda: bench(camera={"gain": 5.0}),

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 
-from fibre.closure import NoiseScale, closure_errors, noise_scale
+from fibre.closure import NoiseScale, closure_errors, closure_tilts, noise_scale
 
 
 def states(n, seed=0):
@@ -75,3 +76,42 @@ def test_quiet_data_never_lower_the_stated_variance():
 def test_the_variance_is_inflation_times_stated_plus_relative_error_squared_times_power():
     found = NoiseScale(2.0, 0.1).variance(np.array([3j, 0]), np.array([0.5, 0.25]))
     np.testing.assert_allclose(found, [1 + 0.09, 0.5])
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_tilts_between_states_are_found_as_well_as_the_noise_allows(n):
+    """Against the Cramer-Rao bound of the slopes by a plain numerical Jacobian of the closure sums."""
+    generator, u = np.random.default_rng(3), np.stack([np.ones(n), np.exp(2j * np.pi * np.arange(n) / n)]) / 2**0.5
+    centres = generator.uniform(-5e-5, 5e-5, (300, 2))
+    centres -= centres.mean(0)
+    clean = linear_fields(u, 600).reshape(n, 2, 300)
+    tilts = generator.normal(scale=3e3, size=(n, 2))
+    pistons = generator.normal(scale=0.1, size=n)
+    tilts, pistons = tilts - tilts.mean(0), pistons - pistons.mean()
+    turned = clean * np.exp(1j * (pistons[:, None] + tilts @ centres.T))[:, None]
+    noise = 0.05
+    found = [
+        closure_tilts(
+            turned + noise * complex_noise(generator, turned.shape), np.full(turned.shape, noise**2), u, centres
+        )
+        for _ in range(40)
+    ]
+    null = scipy.linalg.null_space(u)
+
+    def sums(parameters):
+        ramp = np.exp(1j * (parameters[:n, None] + parameters[n:].reshape(n, 2) @ centres.T))
+        return np.einsum("kc,kpm->cpm", null, clean * ramp[:, None]).ravel() / noise
+
+    scale = np.concatenate([np.ones(n), np.full(2 * n, 2e4)])
+    jacobian = np.stack([(sums(1e-6 * row) - sums(-1e-6 * row)) / 2e-6 for row in np.diag(scale)], 1)
+    bound = np.linalg.pinv(2 * (jacobian.conj().T @ jacobian).real, rcond=1e-9) * np.outer(scale, scale)
+    errors = np.array([np.concatenate([p + pistons, (t + tilts).ravel()]) for p, t in found])
+    ratio = (errors**2).mean(0) / np.diag(bound)
+    # chi-square of 40, within 4 sigma
+    assert np.all(np.abs(ratio - 1) < 4 * np.sqrt(2 / 40))
+
+
+def test_two_states_tell_no_tilt():
+    pistons, tilts = closure_tilts(np.ones((2, 5)), np.ones((2, 5)), np.eye(2), np.arange(10.0).reshape(5, 2))
+    assert np.all(pistons == 0)
+    assert np.all(tilts == 0)

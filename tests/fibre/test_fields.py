@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from acquisition import SimulatedBench, calibrate, capture
 from fibre import Drift, ForwardInverse, reconstruct, recover, retrieve_fields
 from fibre.retrieval.base import RetrievalMethod
-from tests.fibre.benches import METHOD, PLAN
+from tests.fibre.benches import METHOD, PLAN, SAMPLE
 from tests.oracles import jones as oracle
 
 
@@ -113,6 +114,25 @@ def test_a_known_tilt_is_taken_out_of_every_capture(bench):
     assert np.linalg.norm(found.blank - usual.blank) < 0.02 * np.linalg.norm(usual.blank)
     tilted = retrieve_fields(bench.recording, Tilted(METHOD, slope), fibrelets)
     assert np.linalg.norm(tilted.blank - usual.blank) > 0.1 * np.linalg.norm(usual.blank)
+
+
+def test_a_tilt_that_walks_is_followed_by_references_and_closure(bench, tmp_path):
+    scene = replace(bench.scene, tilt_walk=3e3, piston_walk=0.3, image_time=0.9)
+    moving = SimulatedBench(scene, rng=3)
+    plan, sample = replace(PLAN, reference_every=3), replace(SAMPLE, references=3)
+    calibration = calibrate(moving, plan, tmp_path / "calibration")
+    recording = capture(moving, sample, tmp_path / "sample")
+    fibrelets = bench.calibration_fields.fibrelets
+    plain = retrieve_fields(calibration, METHOD, fibrelets)
+    tracked = retrieve_fields(calibration, METHOD, fibrelets, drift="track")
+    assert plain.relative_error > 0.02
+    assert tracked.relative_error < 0.5 * plain.relative_error
+    lit = [retrieve_fields(recording, METHOD, f, drift=d) for f, d in ((tracked, "track"), (plain, None))]
+    assert lit[0].relative_error < 0.5 * lit[1].relative_error
+    with pytest.raises(ValueError, match="fibrelets must be the CalibrationFields"):
+        retrieve_fields(recording, METHOD, fibrelets, drift="track")
+    with pytest.raises(TypeError, match="drift must be Drift"):
+        retrieve_fields(recording, METHOD, fibrelets, drift=3.0)
 
 
 class Stopping(RetrievalMethod):
