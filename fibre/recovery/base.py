@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from tqdm import tqdm
 from fibre.calibration import lit_points, positions_on_camera
 from fibre.records import Calibration, CalibrationFields, Inverse
 from polinfer.checks import one_of_types
+from polinfer.cluster import spread
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
 
@@ -40,7 +41,7 @@ class RecoveryMethod(ABC):
     takes: ClassVar[type] = CalibrationFields
 
     @abstractmethod
-    def solve(self, fields: Any, progress: bool, folder: str | Path | None) -> Inverse:
+    def solve(self, fields: Any, progress: bool, folder: str | Path | None, client: Any = None) -> Inverse:
         """The inverse transmission matrix."""
 
 
@@ -49,13 +50,15 @@ def recover(
     method: RecoveryMethod,
     progress: bool = False,
     folder: str | Path | None = None,
+    client: Any = None,
 ) -> Inverse:
     """The inverse transmission matrix from calibration fields, by ``method`` (for instance ``ForwardInverse()``).
 
     ``IntensityOnly()`` takes the :class:`fibre.Calibration` itself.
 
     ``folder``: where finished rows are kept (made if absent), so that the same call goes on where it was interrupted;
-    None: nowhere. ``progress``: show a bar.
+    None: nowhere. ``progress``: show a bar. ``client``: a ``dask.distributed.Client`` over whose workers the rows are
+    spread (extra ``cluster``), any of which may be lost; None: the threads of this process.
 
     Raises TypeError for other records and methods, ValueError where a point was lit in fewer than two states, where a
     window holds no usable fibrelet, and for a folder of another call.
@@ -65,7 +68,7 @@ def recover(
     if method.takes is Calibration:
         advice = f"pass the calibration itself: {type(method).__name__} retrieves no fields."
     one_of_types("calibration_fields", calibration_fields, (method.takes,), advice)
-    return method.solve(calibration_fields, progress, folder)
+    return method.solve(calibration_fields, progress, folder, client)
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,9 @@ class RowByRow(RecoveryMethod):
         """Points that share a window, from where they are on the camera (p, 2); all p, each once."""
         return [np.array([point]) for point in range(len(positions))]
 
-    def solve(self, fields: CalibrationFields, progress: bool, folder: str | Path | None = None) -> Inverse:
+    def solve(
+        self, fields: CalibrationFields, progress: bool, folder: str | Path | None = None, client: Any = None
+    ) -> Inverse:
         """See :meth:`RecoveryMethod.solve`."""
         prepared = self.prepared(fields)
         positions = positions_on_camera(fields)
@@ -117,26 +122,43 @@ class RowByRow(RecoveryMethod):
         kept = None
         if folder is not None:
             kept = Kept(folder, fingerprint(fields_key(fields), self), (_Rows,), "calibration or method")
-        total = None
-        # small systems: threads of BLAS would cost more than they bring, and those of other groups bring it
-        with (
-            threadpool_limits(1, user_api="blas"),
-            ThreadPoolExecutor(os.cpu_count()) as pool,
-            tqdm(total=len(positions), desc="rows of A^-1", unit="point", disable=not progress) as bar,
-        ):
-            for start in range(0, len(groups), PART):
-                part = groups[start : start + PART]
-                name = f"rows_{start:06d}"
-                found = None if kept is None else kept.read(name)
-                if found is None:
-                    chosen = [_within(tree, width, positions[points], points, usable) for points in part]
-                    values = pool.map(self.rows, [prepared] * len(part), part, chosen)
-                    found = _Rows(_assembled(fields, zip(part, chosen, values, strict=True)))
-                    if kept is not None:
-                        kept.write(name, found)
-                total = found.matrix if total is None else total + found.matrix
-                bar.update(sum(map(len, part)))
+        parts = [groups[start : start + PART] for start in range(0, len(groups), PART)]
+        names = [f"rows_{PART * number:06d}" for number in range(len(parts))]
+        done = {number: kept.read(name) for number, name in enumerate(names)} if kept is not None else {}
+        done = {number: found for number, found in done.items() if found is not None}
+        missing = [number for number in range(len(parts)) if number not in done]
+        tasks = [
+            [(points, _within(tree, width, positions[points], points, usable)) for points in parts[number]]
+            for number in missing
+        ]
+        with tqdm(total=len(positions), desc="rows of A^-1", unit="point", disable=not progress) as bar:
+            bar.update(sum(len(points) for number in done for points in parts[number]))
+            for place, values in self._finished(prepared, tasks, client):
+                number = missing[place]
+                rows = [(points, chosen, v) for (points, chosen), v in zip(tasks[place], values, strict=True)]
+                done[number] = _Rows(_assembled(fields, rows))
+                if kept is not None:
+                    kept.write(names[number], done[number])
+                bar.update(sum(map(len, parts[number])))
+        total = sum((done[number].matrix for number in range(1, len(parts))), start=done[0].matrix)
         return Inverse(scipy.sparse.csr_array(total), self.ridge(prepared), fields)
+
+    def _finished(self, prepared: Any, tasks: list[Any], client: Any) -> Iterator[tuple[int, list[np.ndarray]]]:
+        """Number of a part and its rows, as they are finished."""
+        if client is not None:
+            yield from spread(_rows_of_part, (self, prepared), tasks, client)
+            return
+        # small systems: threads of BLAS would cost more than they bring, and those of other groups bring it
+        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as pool:
+            for number, task in enumerate(tasks):
+                yield number, list(pool.map(lambda pair: self.rows(prepared, *pair), task))
+
+
+def _rows_of_part(common: tuple[RowByRow, Any], task: list[Any]) -> list[np.ndarray]:
+    """On a worker."""
+    method, prepared = common
+    with threadpool_limits(1, user_api="blas"):
+        return [method.rows(prepared, points, chosen) for points, chosen in task]
 
 
 def _within(
@@ -172,7 +194,7 @@ def fields_key(fields: CalibrationFields) -> tuple[np.ndarray, ...]:
 
 
 def _assembled(
-    fields: CalibrationFields, parts: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    fields: CalibrationFields, parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]]
 ) -> scipy.sparse.csr_array:
     count, cores = len(fields.points), len(fields.fibrelets.centres)
     rows, columns, data = [], [], []

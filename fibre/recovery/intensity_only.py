@@ -10,7 +10,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple, get_args
+from typing import Any, ClassVar, NamedTuple, get_args
 
 import numpy as np
 import scipy.sparse
@@ -84,9 +84,11 @@ class IntensityOnly(RecoveryMethod):
         if self.inverse is not None:
             one_of_types("inverse", self.inverse, (ForwardInverse,), "pass ForwardInverse(...).")
 
-    def solve(self, fields: Calibration, progress: bool, folder: str | Path | None = None) -> Inverse:
+    def solve(
+        self, fields: Calibration, progress: bool, folder: str | Path | None = None, client: Any = None
+    ) -> Inverse:
         """See :meth:`RecoveryMethod.solve`; the record is a Calibration."""
-        return (self.inverse or ForwardInverse()).solve(self.fields(fields, progress), progress, folder)
+        return (self.inverse or ForwardInverse()).solve(self.fields(fields, progress), progress, folder, client)
 
     def fields(self, calibration: Calibration, progress: bool = False) -> CalibrationFields:
         """Fields of every capture as the rows give them; the variance says how well the rows are known."""
