@@ -114,8 +114,10 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     lit = lit_points(fields)
     pitch = float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
     if _spot_spacing(positions, lit) < DENSE * pitch:
-        powers = (np.abs(fields.fields) ** 2 - fields.variance).mean(1)[:, clean]
-        return profile_of_patterns(centres, positions, fields.inputs, powers, pitch)
+        # a fibrelet without any field is not dark, but unknown
+        known = clean & np.any(fields.fields != 0, axis=(0, 1))
+        powers = (np.abs(fields.fields) ** 2 - fields.variance).mean(1)[:, known]
+        return profile_of_patterns(fields.fibrelets.centres[known], positions, fields.inputs, powers, pitch)
     for capture, points in enumerate(lit):
         if len(points) == 0:
             continue

@@ -60,9 +60,8 @@ class IntensityOnly(RecoveryMethod):
     Parameters
     ----------
     algorithm: of :func:`fibre.rows_from_intensities`. retrieval: None: ``Modal`` of the fibrelets. fibrelets: where
-    they are; None: found in the images. tie: patterns that are retrieved, >= 1, chosen to light all
-    fibrelets. inverse: how the fields are inverted;
-    None: ``ForwardInverse()``.
+    they are; None: found in the images. tie: patterns that are retrieved, >= 1, chosen to light all fibrelets. inverse:
+    how the fields are inverted; None: ``ForwardInverse()``.
 
     Raises ValueError where no image is in focus, or where the inputs do not tell the rows.
 
@@ -109,8 +108,10 @@ class IntensityOnly(RecoveryMethod):
         status = np.zeros(calibration.images.captures, np.uint8)
         if retrieved.status is not None:
             status[chosen] = retrieved.status
+        # where nothing is known the field is 0, with the variance of the strongest one
+        variance = np.where(np.isfinite(found.variance), found.variance, np.abs(found.values).max() ** 2)
         return CalibrationFields(
-            found.values, found.variance, retrieved.reference, 1.0, 0.0, fibrelets, calibration.inputs,
+            found.values, variance, retrieved.reference, 1.0, 0.0, fibrelets, calibration.inputs,
             calibration.points, calibration.grid, calibration.registration, status,
         )  # fmt: skip
 

@@ -148,6 +148,18 @@ def test_fields_of_a_calibration_need_no_retrieval_but_of_a_few_captures(bench, 
     assert np.linalg.norm(found * turn - true) < 0.01 * np.linalg.norm(true)
 
 
+def test_what_is_not_known_is_finite_and_says_so(bench, inverse):
+    fields = inverse.calibration
+    assert np.all(np.isfinite(fields.variance))
+    unknown = np.all(fields.fields == 0, axis=(0, 1))
+    assert unknown.any()
+    assert np.all(fields.variance[..., unknown] >= np.abs(fields.fields).max() ** 2)
+    # and does not bend the coupling profile
+    at = np.array([1e-6, 4e-6])
+    usual = coupling_profile(bench.calibration_fields)(at)
+    np.testing.assert_allclose(np.log(coupling_profile(fields)(at)), np.log(usual), atol=0.7)
+
+
 def test_held_out_fields_are_recovered(bench, inverse):
     z = complex_noise(np.random.default_rng(1), (32, 20))
     seen = np.stack([bench.seen(column.reshape(2, -1)).ravel() for column in z.T], 1)
