@@ -61,6 +61,11 @@ class Step:
     state: int = 0
     amplitudes: tuple[complex, ...] = ()
 
+    @property
+    def light(self) -> np.ndarray:
+        """Amplitudes of the points, (len(points),), with 1 where none are stated."""
+        return np.array(self.amplitudes) if self.amplitudes else np.ones(len(self.points))
+
 
 @dataclass(frozen=True)
 class Views:
@@ -165,11 +170,10 @@ class GridPlan(Plan):
         spots = [step for step in self.captures if step.kind == "spots"]
         row, column, value = [], [], []
         for capture, step in enumerate(spots):
-            amplitudes = np.array(step.amplitudes) if step.amplitudes else np.ones(len(step.points))
             for polarisation in range(2):
                 row += [polarisation * count + point for point in step.points]
                 column += [capture] * len(step.points)
-                value += (self.illumination[polarisation, step.state] * amplitudes).tolist()
+                value += (self.illumination[polarisation, step.state] * step.light).tolist()
         return scipy.sparse.csr_array((np.array(value), (row, column)), shape=(2 * count, len(spots)))
 
 

@@ -31,7 +31,6 @@ from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
 from .recovery.forward_inverse import ForwardInverse
 from .recovery.intensity_only import IntensityOnly
 from .recovery.intensity_rows import Rows, RowStatus, rows_from_intensities
-from .recovery.refresh import Staleness, refresh, staleness, update_matrix
 from .recovery.ridge import Ridge
 from .recovery.weighted_sum import WeightedSum
 from .registration import Registration, register_facets
@@ -40,6 +39,7 @@ from .retrieval.base import retrieve
 from .retrieval.gerchberg_saxton import GerchbergSaxton
 from .retrieval.modal import Modal
 from .retrieval.transport_of_intensity import TransportOfIntensity
+from .staleness import Staleness, refresh, staleness, update_matrix
 from .transmission import Frame, Transmission
 
 __all__ = [

@@ -14,7 +14,8 @@ import scipy.optimize
 import scipy.sparse
 import scipy.spatial
 
-from fibre.records import CalibrationFields
+from fibre.fibrelets import lattice_pitch, reference_region
+from fibre.records import Calibration, CalibrationFields
 
 __all__ = [
     "Columns",
@@ -24,6 +25,7 @@ __all__ = [
     "lit_points",
     "profile_of_patterns",
     "response_covariance",
+    "spot_spacing",
     "usual_response",
 ]
 
@@ -89,7 +91,7 @@ def lit_points(fields: CalibrationFields) -> list[np.ndarray]:
     return lit
 
 
-def positions_on_camera(fields: CalibrationFields) -> np.ndarray:
+def positions_on_camera(fields: CalibrationFields | Calibration) -> np.ndarray:
     """The distal points on the camera, (p, 2) metres, by the registration."""
     return fields.points @ fields.registration[:, :2].T + fields.registration[:, 2]
 
@@ -97,7 +99,7 @@ def positions_on_camera(fields: CalibrationFields) -> np.ndarray:
 def clean_fibrelets(fields: CalibrationFields) -> np.ndarray:
     """Fibrelets that do not carry the reference spot, bool (m,)."""
     power = (np.abs(fields.reference) ** 2).sum(0)
-    return power <= 0.03 * power.max()
+    return ~reference_region(power)
 
 
 def coupling_profile(fields: CalibrationFields) -> Profile:
@@ -112,8 +114,8 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     centres = fields.fibrelets.centres[clean]
     distance, power, weight = [], [], []
     lit = lit_points(fields)
-    pitch = float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
-    if _spot_spacing(positions, lit) < DENSE * pitch:
+    pitch = lattice_pitch(centres)
+    if spot_spacing(fields) < DENSE * pitch:
         # a fibrelet without any field is not dark, but unknown
         known = clean & np.any(fields.fields != 0, axis=(0, 1))
         powers = (np.abs(fields.fields) ** 2 - fields.variance).mean(1)[:, known]
@@ -148,12 +150,11 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     return Profile(np.array(middle), falling, float(max(-slope, 1 / furthest)))
 
 
-def _spot_spacing(positions: np.ndarray, lit: list[np.ndarray]) -> float:
-    """Typical distance between a lit point and the next one, metres; infinite where they are single."""
-    several = [positions[points] for points in lit if len(points) > 1]
-    if not several:
-        return np.inf
-    return float(np.median(np.concatenate([scipy.spatial.cKDTree(p).query(p, k=2)[0][:, 1] for p in several])))
+def spot_spacing(fields: CalibrationFields) -> float:
+    """Least distance on the camera, metres, between spots that are lit together; infinite if none are."""
+    positions = positions_on_camera(fields)
+    several = [positions[points] for points in lit_points(fields) if len(points) > 1]
+    return min((float(scipy.spatial.cKDTree(p).query(p, k=2)[0][:, 1].min()) for p in several), default=np.inf)
 
 
 def profile_of_patterns(

@@ -19,7 +19,9 @@ import scipy.spatial
 from fibre.records import Fibrelets
 from polinfer.checks import complex_array, real_array, real_number
 
-__all__ = ["ModeBasis", "find_fibrelets", "locate_fibrelets", "mode_matrix"]
+__all__ = ["ModeBasis", "find_fibrelets", "lattice_pitch", "locate_fibrelets", "mode_matrix", "reference_region"]
+
+REFERENCE = 0.03  # of the strongest: fibrelets with more of the reference spot's power belong to it
 
 
 def find_fibrelets(image: Any) -> np.ndarray:
@@ -178,6 +180,16 @@ def _apart(peaks: np.ndarray, distance: float) -> np.ndarray:
     for bright, faint in sorted(map(tuple, np.sort(pairs, axis=1).tolist())):
         kept[faint] &= not kept[bright]
     return peaks[kept]
+
+
+def lattice_pitch(centres: np.ndarray) -> float:
+    """Typical distance between neighbours of ``centres`` (m, 2), in their unit."""
+    return float(np.median(scipy.spatial.cKDTree(centres).query(centres, k=2)[0][:, 1]))
+
+
+def reference_region(power: np.ndarray) -> np.ndarray:
+    """Which fibrelets carry the reference spot, bool (m,), by its power (m,) in each."""
+    return np.asarray(power > REFERENCE * power.max())
 
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:

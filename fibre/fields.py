@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_scale
 from fibre.drift import Drift, track_drift
-from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix
+from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix, reference_region
 from fibre.interference import relative_phase
 from fibre.records import (
     Calibration,
@@ -81,9 +81,8 @@ def _mean_reference(reference: _Amplitudes) -> np.ndarray:
 
 
 def _reference_region(reference: np.ndarray) -> np.ndarray:
-    """Fibrelets that carry the reference spot: more than 3 % of its strongest one's power."""
-    power = (np.abs(reference) ** 2).sum(0)
-    return power > 0.03 * power.max()
+    """Fibrelets that carry the reference spot of this field (2, m)."""
+    return reference_region((np.abs(reference) ** 2).sum(0))
 
 
 @overload
@@ -155,12 +154,13 @@ def retrieve_fields(
     if isinstance(record, Calibration):
         if fibrelets is None:
             fibrelets = fibrelets_of(record)
-        run, reference = _Run(method, fibrelets, progress, None, folder, _closes(record)).following(
+        groups = pattern_groups(record)
+        run, reference = _Run(method, fibrelets, progress, None, folder, _closes(groups)).following(
             drift, record.references, anchor
         )
         mean_reference = _mean_reference(reference)
         fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
-        groups, tilting = pattern_groups(record), fibrelets if tracked else None
+        tilting = fibrelets if tracked else None
         for chosen, states in groups:
             fields.values[chosen] = fields.of(chosen).closed(mean_reference, states, tilting).values
         errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
@@ -180,7 +180,7 @@ def retrieve_fields(
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
-    if drift == "track" and anchor is None:
+    if tracked and anchor is None:
         raise ValueError("fibrelets must be the CalibrationFields where the drift of a Recording is to be tracked.")
     run, reference = _Run(method, fibrelets, progress, None, folder, record.illumination.shape[1] > 2).following(
         drift, record.references, anchor
@@ -207,9 +207,9 @@ def retrieve_fields(
     )
 
 
-def _closes(calibration: Calibration) -> bool:
+def _closes(groups: list[tuple[np.ndarray, np.ndarray]]) -> bool:
     """Whether most captures are one of three states or more of the same pattern."""
-    sizes = [states.shape[1] for _, states in pattern_groups(calibration)]
+    sizes = [states.shape[1] for _, states in groups]
     return sum(size for size in sizes if size > 2) > 0.5 * sum(sizes)
 
 

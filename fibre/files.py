@@ -19,8 +19,8 @@ from fibre.records import (
     RecordingFields,
     Retrieved,
 )
-from fibre.recovery.refresh import Staleness
 from fibre.registration import Registration
+from fibre.staleness import Staleness
 from polinfer import storage
 from polinfer.files import TYPES as BELOW
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import scipy.spatial
 
+from fibre.fibrelets import lattice_pitch
 from polinfer.checks import real_array, real_number
 from polinfer.storage import array
 
@@ -80,7 +81,7 @@ def register_facets(distal: Any, proximal: Any, turn: float = np.pi) -> Registra
     if min(len(distal), len(proximal)) < 20:
         raise ValueError(f"distal and proximal must be 20 fibrelets or more, got {len(distal)} and {len(proximal)}.")
     trees = [scipy.spatial.cKDTree(points) for points in (distal, proximal)]
-    pitches = [float(np.median(tree.query(tree.data, k=2)[0][:, 1])) for tree in trees]
+    pitches = [lattice_pitch(tree.data) for tree in trees]
     starts = _settled(np.array(_starts(distal, proximal, pitches, turn)), distal, trees[1], pitches)
     patch, ways = 2.5 * FIRST * pitches[0], []
     for limit in (patch, np.inf):

@@ -91,8 +91,7 @@ class SimulatedBench:
             if points is None:
                 raise ValueError("points must be given for a step that lights spots.")
             spots = scene.bundle.launch(points[list(step.points)], scene.spot_waist)
-            amplitudes = np.array(step.amplitudes) if step.amplitudes else np.ones(len(step.points))
-            launched += np.outer(state, spots @ amplitudes)
+            launched += np.outer(state, spots @ step.light)
         elif step.kind in ("blank", "sample"):
             places, light, jones, waist = self._sample[1:]
             field = light[:, None] * state if step.kind == "blank" else light[:, None] * (jones @ state)

@@ -20,7 +20,7 @@ import scipy.spatial
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from fibre.calibration import lit_points, positions_on_camera
+from fibre.calibration import positions_on_camera, spot_spacing
 from fibre.records import Calibration, CalibrationFields, Inverse
 from polinfer.checks import one_of_types
 from polinfer.cluster import spread
@@ -172,17 +172,6 @@ def _within(
     if len(both) == 0:
         raise ValueError(f"window {width:g} m holds no usable fibrelet at point {points[0]}; widen it.")
     return both
-
-
-def spot_spacing(fields: CalibrationFields) -> float:
-    """Least distance on the camera, metres, between spots that are lit together; infinite if none are."""
-    positions = positions_on_camera(fields)
-    least = np.inf
-    for points in lit_points(fields):
-        if len(points) > 1:
-            away, _ = scipy.spatial.cKDTree(positions[points]).query(positions[points], k=2)
-            least = min(least, float(away[:, 1].min()))
-    return least
 
 
 def fields_key(fields: CalibrationFields) -> tuple[np.ndarray, ...]:

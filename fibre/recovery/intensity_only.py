@@ -10,7 +10,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, get_args
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse
@@ -18,8 +18,8 @@ import scipy.spatial
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from fibre.calibration import Profile, profile_of_patterns
-from fibre.fibrelets import mode_matrix
+from fibre.calibration import Profile, positions_on_camera, profile_of_patterns
+from fibre.fibrelets import lattice_pitch, mode_matrix, reference_region
 from fibre.fields import fibrelets_of, pattern_groups, retrieve_fields
 from fibre.records import Calibration, CalibrationFields, Fibrelets, Images, Inverse
 from fibre.recovery.base import RecoveryMethod
@@ -38,7 +38,6 @@ MODEL = 0.01  # relative error of intensities that is not in the images' noise: 
 UNKNOWN = 0.01  # relative variance of a typical row beyond which it is not known
 SYNCHRONISE = 20  # times between the phases of fibrelets and those of captures
 FAINT = 1e-4  # of a neighbour's light: nothing
-REFERENCE = 0.03  # of the strongest: fibrelets with more of the reference spot's power carry no columns
 
 
 @dataclass(frozen=True)
@@ -59,16 +58,16 @@ class IntensityOnly(RecoveryMethod):
 
     Parameters
     ----------
-    algorithm: of :func:`fibre.rows_from_intensities`. retrieval: None: ``Modal`` of the fibrelets. fibrelets: where
-    they are; None: found in the images. tie: patterns that are retrieved, >= 1, chosen to light all fibrelets. inverse:
-    how the fields are inverted; None: ``ForwardInverse()``.
+    algorithm: of :func:`fibre.rows_from_intensities`, but for "spectral". retrieval: None: ``Modal`` of the fibrelets.
+    fibrelets: where they are; None: found in the images. tie: patterns that are retrieved, >= 1, chosen to light all
+    fibrelets. inverse: how the fields are inverted; None: ``ForwardInverse()``.
 
     Raises ValueError where no image is in focus, or where the inputs do not tell the rows.
 
     Source: the sources of :func:`fibre.rows_from_intensities`, used for a calibration as in Gordon et al. (2018), 8.
     """
 
-    algorithm: Algorithm = "variational"
+    algorithm: Literal["variational", "message_passing"] = "variational"
     retrieval: RetrievalMethod | None = None
     fibrelets: Fibrelets | None = None
     tie: int = 4
@@ -77,8 +76,9 @@ class IntensityOnly(RecoveryMethod):
     takes: ClassVar[type] = Calibration
 
     def __post_init__(self) -> None:
-        if self.algorithm not in get_args(Algorithm):
-            raise ValueError(f"algorithm must be one of {get_args(Algorithm)}, got {self.algorithm!r}.")
+        # the spectral start alone says nothing of its errors
+        if self.algorithm not in ("variational", "message_passing"):
+            raise ValueError(f"algorithm must be 'variational' or 'message_passing', got {self.algorithm!r}.")
         integer("tie", self.tie, low=1)
         if self.inverse is not None:
             one_of_types("inverse", self.inverse, (ForwardInverse,), "pass ForwardInverse(...).")
@@ -90,7 +90,7 @@ class IntensityOnly(RecoveryMethod):
         return (self.inverse or ForwardInverse()).solve(self.fields(fields, progress), progress, folder, client)
 
     def fields(self, calibration: Calibration, progress: bool = False) -> CalibrationFields:
-        """Fields of every capture as the rows give them; the variance says how well the rows are known."""
+        """Fields of every capture as the rows give them; the variance is that of what its intensities say."""
         fibrelets = fibrelets_of(calibration) if self.fibrelets is None else self.fibrelets
         optics = _Optics.of(fibrelets, calibration.images)
         seen, alone = optics.intensities(calibration.images), optics.intensities(calibration.references)
@@ -234,10 +234,8 @@ class _Work(NamedTuple):
     ) -> _Work:  # fmt: skip
         """With the coupling profile of the inputs."""
         power = alone.values[:, 1:].mean((0, 1))
-        usable = power <= REFERENCE * power.max()
-        positions = calibration.points @ calibration.registration[:, :2].T + calibration.registration[:, 2]
-        tree = scipy.spatial.cKDTree(fibrelets.centres)
-        pitch = float(np.median(tree.query(fibrelets.centres, k=2)[0][:, 1]))
+        usable, positions = ~reference_region(power), positions_on_camera(calibration)
+        pitch = lattice_pitch(fibrelets.centres)
         # the mean over the steps is half of the power of H and V together
         mean = seen.values[:, 1:].mean(1) - power
         profile = profile_of_patterns(fibrelets.centres[usable], positions, calibration.inputs, mean[:, usable], pitch)

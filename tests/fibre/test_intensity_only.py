@@ -180,8 +180,18 @@ def test_the_right_record_is_asked_for(bench):
         recover(bench.calibration, ForwardInverse())
     with pytest.raises(ValueError, match="tie must be >= 1"):
         IntensityOnly(tie=0)
-    with pytest.raises(ValueError, match="algorithm must be"):
-        IntensityOnly(algorithm="magic")
+    for algorithm in ("magic", "spectral"):
+        with pytest.raises(ValueError, match="algorithm must be"):
+            IntensityOnly(algorithm=algorithm)
+
+
+@pytest.mark.slow  # twice the time of the other algorithm
+def test_message_passing_finds_the_same_calibration(bench, patterns, inverse):
+    fibrelets = bench.calibration_fields.fibrelets
+    method = IntensityOnly("message_passing", retrieval=benches.METHOD, fibrelets=fibrelets)
+    found, other = method.fields(patterns).fields, inverse.calibration.fields
+    turn = np.exp(1j * np.angle(np.vdot(found, other)))
+    assert np.linalg.norm(found * turn - other) < 0.02 * np.linalg.norm(other)
 
 
 def test_images_out_of_focus_are_refused(patterns):

@@ -13,6 +13,7 @@ import scipy.ndimage
 import scipy.sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from fibre.fibrelets import lattice_pitch
 from fibre.retrieval.modal.views import Views
 
 __all__ = ["Coupling", "Found", "Problem", "make_coupling", "refine"]
@@ -66,7 +67,7 @@ class Found:
 def make_coupling(tree: scipy.spatial.cKDTree, views: Views, radii: np.ndarray) -> Coupling:
     """Of Gaussian beams of 1/e radii (image,), metres: squares of two overlap by exp(-d^2 / w^2) / (pi w^2)."""
     centres = np.asarray(tree.data)
-    pitch = float(np.median(tree.query(centres, k=2)[0][:, 1]))
+    pitch = lattice_pitch(centres)
     reach = min(1.9 * float(radii.max()), NEAR * pitch)
     pairs = tree.query_pairs(reach, output_type="ndarray")
     squared = ((centres[pairs[:, 0]] - centres[pairs[:, 1]]) ** 2).sum(-1)

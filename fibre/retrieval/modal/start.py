@@ -15,6 +15,7 @@ import scipy.sparse.csgraph
 import scipy.spatial
 from scipy.sparse.linalg import cg, splu
 
+from fibre.fibrelets import lattice_pitch
 from fibre.records import Fibrelets
 from fibre.retrieval.modal.views import Views
 
@@ -74,7 +75,7 @@ def make_neighbours(
     """The equations, or None where no defocused image is local enough. ``fields``, ``radii``: of :func:`spreads`, on
     the camera's pixels of size ``fine``."""
     tree = scipy.spatial.cKDTree(fibrelets.centres)
-    pitch = float(np.median(tree.query(fibrelets.centres, k=2)[0][:, 1]))
+    pitch = lattice_pitch(fibrelets.centres)
     order = np.argsort(radii)
     planes = order[radii[order] <= 0.6 * pitch]
     # one image in focus has no phases in it, two have them with one sign or the other
