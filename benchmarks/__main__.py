@@ -15,6 +15,7 @@ ALL = (
     "bundle",
     "images",
     "recovery",
+    "design",
     "intensities",
     "peers",
     "chain",

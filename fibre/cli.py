@@ -85,7 +85,8 @@ def retrieve_command(
     if status.any():
         click.echo(f"{np.count_nonzero(status)} of {len(status)} captures did not converge or misfit their images")
     click.echo(
-        f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field"
+        f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field, "
+        f"and {100 * fields.stray:.2f} % of its mean"
     )
 
 

@@ -14,19 +14,32 @@ import scipy.optimize
 
 from polinfer.checks import complex_array, real_array
 
-__all__ = ["NoiseScale", "closure_errors", "closure_phases", "closure_tilts", "noise_scale"]
+__all__ = ["NoiseScale", "closure_errors", "closure_phases", "closure_tilts", "noise_of_groups", "noise_scale"]
+
+FAILED = 2.0  # squared closure errors over the expected, above which a group is not like the others
 
 
 @dataclass(frozen=True)
 class NoiseScale:
-    """True variance = inflation x stated variance + relative_error^2 x |field|^2; inflation >= 1."""
+    """True variance = inflation x stated variance + relative_error^2 x |field|^2 + stray^2 x mean |field|^2.
+
+    inflation >= 1; the mean is that of a capture, over both polarisations and all fibrelets.
+    """
 
     inflation: float = 1.0
     relative_error: float = 0.0
+    stray: float = 0.0
+
+    def expected(self, errors: np.ndarray) -> np.ndarray:
+        """Squared closure errors that are to be expected, (count,), of ``errors`` as in :func:`noise_scale`."""
+        factors = np.array([self.inflation, self.relative_error**2, self.stray**2])
+        return np.asarray(factors[: len(errors) - 1] @ errors[1:])
 
     def variance(self, fields: np.ndarray, stated: np.ndarray) -> np.ndarray:
-        """Variance of ``fields`` whose image noise alone gives ``stated``."""
-        return self.inflation * stated + self.relative_error**2 * np.abs(fields) ** 2
+        """Variance of ``fields`` (..., 2, m) whose image noise alone gives ``stated``."""
+        power = np.abs(fields) ** 2
+        mean = power.mean((-2, -1), keepdims=True)
+        return self.inflation * stated + self.relative_error**2 * power + self.stray**2 * mean
 
 
 def closure_errors(fields: np.ndarray, variance: np.ndarray, states: np.ndarray) -> np.ndarray:
@@ -57,7 +70,8 @@ def closure_phases(fields: np.ndarray, variance: np.ndarray, states: np.ndarray,
     r"""Phases by which n captures should be turned so that their states close best, (n,) radians of mean 0.
 
     Minimises :math:`\sum_c \sum |\sum_k c_k e^{i \phi_k} y_k|^2 / \mathrm{var}` over the phases, one after the other
-    (each has a closed form) from 0. Thousands of amplitudes have a say, where a reference spot has a few. With fewer
+    (each has a closed form), from 0 and from the eigenvector that closes without noise; the better counts. Thousands
+    of amplitudes have a say, where a reference spot has a few. With fewer
     than three states nothing can be told and all phases are 0. Shapes as in :func:`closure_errors`.
 
     >>> states = np.array([[1, 1, 1], [1, 1j, -1]])
@@ -75,15 +89,28 @@ def closure_phases(fields: np.ndarray, variance: np.ndarray, states: np.ndarray,
     weight = 1 / real_array("variance", variance).reshape(count, -1).mean(0)
     gram = (flat.conj() * weight) @ flat.T
     matrix = gram * (null.conj() @ null.T)
+    first = np.linalg.eigh((matrix + matrix.conj().T) / 2)[1][:, 0]
     np.fill_diagonal(matrix, 0)
-    turn = np.ones(count, complex)
-    for _ in range(iterations):
-        for k in range(count):
-            pull = matrix[k] @ turn
-            turn[k] = -pull / abs(pull) if pull != 0 else turn[k]
+    turn = min(
+        (_turned(matrix, start, iterations) for start in (np.ones(count, complex), np.exp(1j * np.angle(first)))),
+        key=lambda found: float((found.conj() @ matrix @ found).real),
+    )
     phases = np.angle(turn / turn[0])
     # only differences of phase are seen: keep the captures, on average, where the reference put them
     return phases - phases.mean()
+
+
+def _turned(matrix: np.ndarray, start: np.ndarray, iterations: int) -> np.ndarray:
+    """Numbers of modulus 1 that make x^H M x small, one after the other; M has no diagonal."""
+    turn = start
+    for _ in range(iterations):
+        before = turn.copy()
+        for k in range(len(turn)):
+            pull = matrix[k] @ turn
+            turn[k] = -pull / abs(pull) if pull != 0 else turn[k]
+        if np.abs(turn - before).max() < 1e-12:
+            break
+    return turn
 
 
 def closure_tilts(
@@ -131,19 +158,55 @@ def closure_tilts(
 
 
 def noise_scale(errors: np.ndarray) -> NoiseScale:
-    """The noise that makes squared closure errors (3, count) as large as expected, each being exponential.
+    """The noise that makes squared closure errors as large as expected, each being exponential.
 
-    Phase retrieval errs in two ways: by the image noise, alike everywhere, and by a phase that wanders over the frame,
-    in proportion to the field. Non-negative least squares in units of the expectation (reweighted; the maximum
-    likelihood of exponential variables), the first factor never below 1. Without data (fewer than three states)
+    ``errors`` (3 or 4, count): squared, their stated variance, the power they stem from, and the mean power of their
+    captures. Phase retrieval errs in three ways: by the image noise, alike everywhere; by a phase that wanders over the
+    frame, in proportion to the field; and by light of the bright places that it puts into dark ones, in proportion to
+    all the light (0 without the fourth row). Non-negative least squares in units of the expectation (reweighted; the
+    maximum likelihood of exponential variables), the first factor never below 1. Without data (fewer than three states)
     nothing is changed.
     """
-    squared, stated, power = errors.reshape(3, -1)
+    squared, stated, *powers = errors.reshape(len(errors), -1)
     if squared.size == 0:
         return NoiseScale()
-    excess, relative = 0.0, float(np.sum(np.maximum(squared - stated, 0)) / max(np.sum(power), 1e-300))
+    excess, factors = 0.0, np.zeros(len(powers))
+    factors[0] = np.sum(np.maximum(squared - stated, 0)) / max(np.sum(powers[0]), 1e-300)
     for _ in range(30):
-        expected = (1 + excess) * stated + relative * power
-        design = np.stack([stated, power], 1) / expected[:, None]
-        (excess, relative), _ = scipy.optimize.nnls(design, (squared - stated) / expected)
-    return NoiseScale(1 + float(excess), float(np.sqrt(relative)))
+        expected = (1 + excess) * stated + factors @ np.stack(powers)
+        design = np.stack([stated, *powers], 1) / expected[:, None]
+        (excess, *rest), _ = scipy.optimize.nnls(design, (squared - stated) / expected)
+        factors = np.array(rest)
+    return NoiseScale(1 + float(excess), *np.sqrt(factors).tolist())
+
+
+def noise_of_groups(groups: list[np.ndarray]) -> tuple[NoiseScale, np.ndarray]:
+    """The noise of most groups of captures, and by how much each group's variance is larger, (groups,), >= 1.
+
+    A retrieval can fail in one capture of many: its group closes far worse than the others, must not set the noise of
+    all, and is not to be believed as they are. Groups whose errors are more than twice what the noise makes expected on
+    average are left out of it, again until none is, and get the factor that they show; all others get 1. ``groups``:
+    errors as in :func:`noise_scale`, one array (4, count) a group, none for groups of fewer than three states.
+
+    >>> rng = np.random.default_rng(0)
+    >>> powers = np.ones((3, 500))
+    >>> quiet = [np.concatenate([rng.exponential(1.0, (1, 500)), powers * [[1], [0], [0]]]) for _ in range(9)]
+    >>> failed = np.concatenate([rng.exponential(50.0, (1, 500)), powers * [[1], [0], [0]]])
+    >>> scale, factors = noise_of_groups([*quiet, failed])
+    >>> bool(scale.inflation < 1.1), factors[:9].tolist() == [1.0] * 9, bool(factors[9] > 40)
+    (True, True, True)
+    """
+    usable = np.array([errors.size > 0 for errors in groups], bool)
+    factors = np.ones(len(groups))
+    if not usable.any():
+        return NoiseScale(), factors
+    kept = usable.copy()
+    while True:
+        scale = noise_scale(np.concatenate([e for e, k in zip(groups, kept, strict=True) if k], axis=1))
+        for i in np.flatnonzero(usable):
+            factors[i] = np.mean(groups[i][0] / np.maximum(scale.expected(groups[i]), 1e-300))
+        # the worst first, as long as it is a minority that goes
+        worst = np.argmax(np.where(kept, factors, 0))
+        if factors[worst] <= FAILED or kept.sum() - 1 < 0.5 * usable.sum():
+            return scale, np.where(factors > FAILED, factors, 1.0)
+        kept[worst] = False

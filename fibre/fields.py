@@ -7,16 +7,19 @@ illumination states has checked. Called by users and by the ``retrieve`` command
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, overload
 
 import numpy as np
+import scipy.spatial
 from tqdm import tqdm
 
-from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_scale
+from fibre.calibration import positions_on_camera
+from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
 from fibre.drift import Drift, track_drift
-from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix, reference_region
+from fibre.fibrelets import ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
 from fibre.interference import relative_phase
 from fibre.records import (
     Calibration,
@@ -33,6 +36,8 @@ from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
 
 __all__ = ["fibrelets_of", "pattern_groups", "retrieve_fields"]
+
+APART = 5.0  # fibrelets between neighbouring spots, from which on the light of each is closed by itself
 
 
 @dataclass(frozen=True)
@@ -67,6 +72,16 @@ class _Amplitudes:
         pistons, tilts = closure_tilts(fields, variance, states, fibrelets.centres[outside])
         phase = pistons[:, None] + tilts @ (fibrelets.centres - middle).T
         return replace(self, values=self.values * np.exp(1j * phase)[:, None])
+
+    def closed_apart(self, reference: np.ndarray, states: np.ndarray, owner: np.ndarray) -> _Amplitudes:
+        """Captures of spots whose light does not meet, that of each turned by itself; ``owner`` (m,): its spot."""
+        outside = ~_reference_region(reference)
+        fields, values = self.values - reference, self.values.copy()
+        for spot in np.unique(owner):
+            near = outside & (owner == spot)
+            phases = closure_phases(fields[..., near], self.variance[..., near], states)
+            values[..., near] = reference[:, near] + fields[..., near] * np.exp(1j * phases)[:, None, None]
+        return replace(self, values=values)
 
 
 def _mean_reference(reference: _Amplitudes) -> np.ndarray:
@@ -116,14 +131,20 @@ def retrieve_fields(
     H comes from the defocused images by ``method``, V = (H^* V)/H^* from the phase-stepped ones, each projected on
     the modes by weighted least squares. The common phase that intensities cannot know is fixed by the reference spot,
     which every capture contains, and then, between the states of one scene, by their closure
-    (:func:`fibre.closure.closure_phases`): the spot lights a dozen fibrelets, the scene hundreds. The spot's own light
+    (:func:`fibre.closure.closure_phases`): the spot lights a dozen fibrelets, the scene hundreds. Where the spots of a
+    calibration are five fibrelets or more apart, no plane may show how their light interferes: then the light of every
+    spot is closed by itself, which leaves one unknown phase a point, the same in all states and both polarisations, so
+    that it drops out of what is measured against a blank. The reference spot's own light
     is then subtracted. The spot must stand clear of the sample: light of the sample on the spot's fibrelets turns the
     phase of its capture.
 
-    The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power,
-    both found from the data: n states of illumination span two dimensions, so n - 2 combinations of the fields must
-    vanish (:func:`fibre.closure.closure_errors`), and how far they do not measures all that the image noise does not
-    explain. With two states there is no such check, and the image noise is all that is stated.
+    The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power
+    plus a ``stray`` squared times the mean power of the capture, all found from the data: n states of illumination span
+    two dimensions, so n - 2 combinations of the fields must vanish (:func:`fibre.closure.closure_errors`), and how far
+    they do not measures all that the image noise does not explain. Captures of a calibration whose states close far
+    worse than the others' have failed: they get the variance that they show
+    (:func:`fibre.closure.noise_of_groups`). With two states there is no such check, and the image noise is all that is
+    stated.
 
     Parameters
     ----------
@@ -161,13 +182,22 @@ def retrieve_fields(
         mean_reference = _mean_reference(reference)
         fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
         tilting = fibrelets if tracked else None
+        apart = _spots_apart(record, fibrelets)
         for chosen, states in groups:
-            fields.values[chosen] = fields.of(chosen).closed(mean_reference, states, tilting).values
+            part, owner = fields.of(chosen), apart(chosen)
+            if owner is None or tilting is not None:
+                part = part.closed(mean_reference, states, tilting)
+            if owner is not None:
+                part = part.closed_apart(mean_reference, states, owner)
+            fields.values[chosen] = part.values
         errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
-        noise = noise_scale(np.concatenate([np.empty((3, 0)), *errors], axis=1))
+        noise, factors = noise_of_groups(errors)
+        variance = noise.variance(fields.values, fields.variance)
+        for (chosen, _), factor in zip(groups, factors, strict=True):
+            variance[chosen] *= factor
         return CalibrationFields(
             fields.values - mean_reference,
-            noise.variance(fields.values, fields.variance),
+            variance,
             mean_reference,
             noise.inflation,
             noise.relative_error,
@@ -177,6 +207,7 @@ def retrieve_fields(
             record.grid,
             record.registration,
             fields.status,
+            noise.stray,
         )
     if fibrelets is None:
         raise ValueError("fibrelets must be given for a Recording; pass calibration_fields.fibrelets.")
@@ -204,7 +235,25 @@ def retrieve_fields(
         record.illumination,
         fields.status,
         blank.status,
+        noise.stray,
     )
+
+
+def _spots_apart(record: Calibration, fibrelets: Fibrelets) -> Callable[[np.ndarray], np.ndarray | None]:
+    """For captures of one pattern: the nearest of its spots to every fibrelet (m,); None where their light meets."""
+    positions, inputs, count = positions_on_camera(record), record.inputs.tocsc(), len(record.points)
+    pitch = lattice_pitch(fibrelets.centres)
+
+    def owner(captures: np.ndarray) -> np.ndarray | None:
+        spots = positions[np.unique(inputs[:, [captures[0]]].nonzero()[0] % count)]
+        if len(spots) < 2:
+            return None
+        tree = scipy.spatial.cKDTree(spots)
+        if tree.query(spots, k=2)[0][:, 1].min() < APART * pitch:
+            return None
+        return np.asarray(tree.query(fibrelets.centres)[1])
+
+    return owner
 
 
 def _closes(groups: list[tuple[np.ndarray, np.ndarray]]) -> bool:
@@ -336,12 +385,14 @@ class _Run:
 
 
 def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Closure errors (3, count) outside the reference spot, whose light does not follow the states."""
+    """Closure errors (4, count) outside the reference spot, whose light does not follow the states."""
     outside = ~_reference_region(reference)
     values = (fields.values - reference)[..., outside]
     squared, stated, _ = closure_errors(values, fields.variance[..., outside], states)
     _, _, power = closure_errors(fields.values[..., outside], fields.variance[..., outside], states)
-    return np.stack([squared, stated, power]).reshape(3, -1)
+    mean = (np.abs(fields.values) ** 2).mean((1, 2), keepdims=True)
+    _, _, light = closure_errors(np.sqrt(mean), mean, states)
+    return np.stack([squared, stated, power, np.broadcast_to(light, power.shape)]).reshape(4, -1)
 
 
 def pattern_groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:

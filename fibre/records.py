@@ -10,7 +10,7 @@ Their array fields are declared for storage, so every one can be saved and loade
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -286,9 +286,10 @@ class CalibrationFields:
 
     fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape,
     E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation,
-    relative_error: what the closure of the illumination states found beyond the image noise (1 and 0 = nothing);
-    ``variance`` contains both. inputs, points, grid, registration: as in :class:`Calibration`. status:
-    :class:`RetrievalStatus` of every capture (captures,), None where no retrieval was made.
+    relative_error, stray: what the closure of the illumination states found beyond the image noise (1, 0 and 0 =
+    nothing; :class:`fibre.closure.NoiseScale`); ``variance`` contains them. inputs, points, grid, registration: as in
+    :class:`Calibration`. status: :class:`RetrievalStatus` of every capture (captures,), None where no retrieval was
+    made.
     """
 
     fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -302,15 +303,38 @@ class CalibrationFields:
     grid: tuple[int, int] = setting()
     registration: np.ndarray = array(("row_column", "affine"), "1")
     status: np.ndarray | None = array(("capture",), "1", default=None)
+    stray: float = setting(default=0.0)
+
+    def select(self, captures: Any) -> CalibrationFields:
+        """Only some captures, indices (n,) or bool (captures,): a calibration with others missing, or known to be bad.
+
+        A recovery needs every point lit in two states or more, and says which is not. Captures that fail to close are
+        down-weighted by their variance already. ValueError: an index of no capture, or none selected.
+        """
+        count = len(self.fields)
+        chosen = np.asarray(captures)
+        if chosen.dtype == bool and chosen.shape == (count,):
+            chosen = np.flatnonzero(chosen)
+        if chosen.ndim != 1 or chosen.dtype.kind not in "ui" or not np.all((chosen >= 0) & (chosen < count)):
+            raise ValueError(f"captures must be indices below {count} or bool ({count},), got {captures!r}.")
+        if len(chosen) == 0 or len(np.unique(chosen)) < len(chosen):
+            raise ValueError(f"captures must be some of the captures, each once, got {captures!r}.")
+        return replace(
+            self,
+            fields=self.fields[chosen],
+            variance=self.variance[chosen],
+            inputs=scipy.sparse.csr_array(self.inputs)[:, chosen],
+            status=None if self.status is None else self.status[chosen],
+        )
 
 
 @dataclass(frozen=True)
 class RecordingFields:
     """Mode amplitudes of a recording: n states with the sample and n without, in the calibration's fibrelets.
 
-    fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real, E|error|^2,
-    ``inflation`` and ``relative_error`` contained. illumination: complex (2, n), nominal. status, blank_status:
-    :class:`RetrievalStatus` (n,), or None.
+    fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real,
+    E|error|^2, ``inflation``, ``relative_error`` and ``stray`` contained. illumination: complex (2, n), nominal.
+    status, blank_status: :class:`RetrievalStatus` (n,), or None.
     """
 
     fields: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -323,6 +347,7 @@ class RecordingFields:
     illumination: np.ndarray = array(("polarisation", "state"), "1")
     status: np.ndarray | None = array(("state",), "1", default=None)
     blank_status: np.ndarray | None = array(("state",), "1", default=None)
+    stray: float = setting(default=0.0)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from fibre.closure import NoiseScale, closure_errors, closure_tilts, noise_scale
+from fibre.closure import NoiseScale, closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
 
 
 def states(n, seed=0):
@@ -74,8 +74,52 @@ def test_quiet_data_never_lower_the_stated_variance():
 
 
 def test_the_variance_is_inflation_times_stated_plus_relative_error_squared_times_power():
-    found = NoiseScale(2.0, 0.1).variance(np.array([3j, 0]), np.array([0.5, 0.25]))
-    np.testing.assert_allclose(found, [1 + 0.09, 0.5])
+    fields = np.array([[3j, 0, 0, 1], [0, 2, 0, 0]])  # mean power 14 / 8
+    found = NoiseScale(2.0, 0.1, 0.2).variance(fields, np.full((2, 4), 0.5))
+    np.testing.assert_allclose(found, 1 + 0.01 * np.abs(fields) ** 2 + 0.04 * 14 / 8)
+
+
+def test_light_strayed_into_dark_places_is_told_from_an_error_in_proportion():
+    """What belongs to the mean must not be ascribed to bright amplitudes, which would then be believed too little."""
+    u, count = states(3), 4000
+    generator = np.random.default_rng(6)
+    clean = linear_fields(u, count)
+    light = np.broadcast_to((np.abs(clean) ** 2).mean(1, keepdims=True), clean.shape)
+    noisy = clean + np.sqrt(0.01**2 * np.abs(clean) ** 2 + 0.02**2 * light) * complex_noise(generator, clean.shape)
+    errors = closure_errors(noisy, 1e-9 * np.abs(clean) ** 2, u)
+    strayed = closure_errors(np.sqrt(light), light, u)[2]
+    scale = noise_scale(np.concatenate([errors, strayed[None]]).reshape(4, -1))
+    assert scale.relative_error == pytest.approx(0.01, rel=0.15)
+    assert scale.stray == pytest.approx(0.02, rel=0.05)
+    assert noise_scale(errors.reshape(3, -1)).relative_error > 0.1
+
+
+def test_phases_are_found_from_any_start():
+    """An isolated spot's light comes with any phase in every state, not only with a small one."""
+    u, generator = states(3), np.random.default_rng(7)
+    clean = linear_fields(u, 30)
+    for _ in range(50):
+        phases = generator.uniform(-np.pi, np.pi, 3)
+        found = closure_phases(np.exp(1j * phases)[:, None] * clean, np.ones(clean.shape), u)
+        left = np.exp(1j * (found + phases))
+        np.testing.assert_allclose(left / left[0], 1, atol=1e-6)
+
+
+def test_one_failed_group_neither_sets_the_noise_of_all_nor_is_believed():
+    u, generator = states(3), np.random.default_rng(8)
+
+    def errors(noise):
+        clean = linear_fields(u, 300)
+        noisy = clean + noise * complex_noise(generator, clean.shape)
+        return closure_errors(noisy, np.full(clean.shape, 1e-4), u).reshape(3, -1)
+
+    scale, factors = noise_of_groups([errors(0.01) for _ in range(7)] + [errors(0.1)])
+    assert scale.inflation < 1.1
+    np.testing.assert_array_equal(factors[:7], 1)
+    assert factors[7] == pytest.approx(100, rel=0.2)
+    # none has failed where all are alike
+    assert np.all(noise_of_groups([errors(0.1) for _ in range(5)])[1] == 1)
+    assert noise_of_groups([np.empty((3, 0))])[0] == NoiseScale()
 
 
 @pytest.mark.parametrize("n", [3, 4])

@@ -4,9 +4,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import scipy.sparse
 
-from acquisition import SimulatedBench, calibrate, capture
-from fibre import Drift, ForwardInverse, reconstruct, recover, retrieve_fields
+from acquisition import CalibrationPlan, SimulatedBench, calibrate, capture
+from fibre import (
+    Bundle,
+    Calibration,
+    CalibrationFields,
+    Drift,
+    Fibrelets,
+    ForwardInverse,
+    Images,
+    reconstruct,
+    recover,
+    retrieve_fields,
+)
+from fibre.fields import _Amplitudes, _spots_apart, pattern_groups
 from fibre.retrieval.base import RetrievalMethod
 from tests.fibre.benches import METHOD, PLAN, SAMPLE
 from tests.oracles import jones as oracle
@@ -181,3 +194,90 @@ def test_other_records_and_recordings_without_fibrelets_are_refused(bench):
         retrieve_fields(bench.calibration_fields, METHOD)
     with pytest.raises(ValueError, match="fibrelets must be given for a Recording"):
         retrieve_fields(bench.recording, METHOD)
+
+
+@pytest.fixture(scope="module")
+def far_apart():
+    """Sixteen points, four of them lit at a time, 32 um apart."""
+    bundle = Bundle.hexagonal(radius=36e-6, rng=3)
+    plan = CalibrationPlan((4, 4), pitch=16e-6, stride=2)
+    launch = bundle.launch(plan.points, 2.5e-6)
+    matrix = (bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray()
+    clean = (matrix @ plan.inputs.toarray()).T.reshape(-1, 2, bundle.cores)
+
+    def images(count):
+        stack = np.ones((count, 5, 8, 8))
+        return Images(stack, stack, stack > 1, [-1e-5, 1e-5], [0, 2, 4], np.arange(count), 850e-9, 1e-6)
+
+    calibration = Calibration(images(len(clean)), plan.inputs, plan.points, plan.grid, images(1), np.eye(2, 3))
+    return bundle, matrix, clean, calibration
+
+
+def test_the_light_of_spots_that_do_not_meet_is_closed_spot_by_spot(far_apart):
+    """Every spot with an unknown phase in every capture, as intensities leave it: one phase a point remains."""
+    bundle, matrix, clean, calibration = far_apart
+    fibrelets, generator = Fibrelets(bundle.centres, bundle.mode_radius), np.random.default_rng(0)
+    spots, dark = _spots_apart(calibration, fibrelets), np.zeros((2, bundle.cores), complex)
+    dark[:, 0] = 1e-9  # a reference spot far away
+    noise = 1e-3 * np.sqrt((np.abs(clean) ** 2).mean())
+    variance = np.full(clean.shape, noise**2)
+    errors = []
+    for apart in (False, True):
+        fields = clean + noise * (generator.standard_normal(clean.shape) + 1j * generator.standard_normal(clean.shape))
+        for chosen, states in pattern_groups(calibration):
+            owner = spots(chosen)
+            assert owner is not None
+            phases = generator.uniform(-np.pi, np.pi, (len(chosen), 4))
+            part = _Amplitudes(fields[chosen] * np.exp(1j * phases)[:, None, owner], variance[chosen], np.zeros(3))
+            part = part.closed_apart(dark, states, owner) if apart else part.closed(dark, states, None)
+            fields[chosen] = part.values
+        found = recover(
+            CalibrationFields(fields, variance, dark, 1.0, 0.0, fibrelets, calibration.inputs, calibration.points,
+                              calibration.grid, np.eye(2, 3)), ForwardInverse(window=40e-6),
+        )  # fmt: skip
+        z = generator.standard_normal((32, 10)) + 1j * generator.standard_normal((32, 10))
+        seen = (found.matrix @ (matrix @ z)).reshape(2, 16, 10)
+        true = z.reshape(2, 16, 10)
+        seen = seen * np.exp(1j * np.angle((seen.conj() * true).sum((0, 2))))[:, None]
+        errors.append(np.linalg.norm(seen - true) / np.linalg.norm(true))
+    assert errors[1] < 0.05
+    assert errors[0] > 0.3
+
+
+def test_spots_whose_light_meets_stay_together(bench):
+    spots = _spots_apart(bench.calibration, bench.calibration_fields.fibrelets)
+    assert spots(pattern_groups(bench.calibration)[0][0]) is None
+
+
+def test_a_calibration_works_without_some_of_its_captures_and_says_when_it_cannot(standard):
+    fields = standard.calibration(0.01, 1)
+    z = standard.light()[:, None] * np.ones(2)
+    z = z.T.reshape(-1, 1)
+
+    def error(some):
+        found = recover(some, ForwardInverse()).matrix @ (standard.matrix @ z)
+        return np.linalg.norm(found - z) / np.linalg.norm(z)
+
+    keep = np.ones(len(fields.fields), bool)
+    keep[[1, 9, 20]] = False  # one state of three patterns
+    fewer = fields.select(keep)
+    assert len(fewer.fields) == fewer.inputs.shape[1] == keep.sum()
+    assert error(fewer) < 2 * error(fields)
+    with pytest.raises(ValueError, match="two states of polarisation"):
+        recover(fields.select(np.arange(2, len(keep))), ForwardInverse())
+    for bad in ([], [0, 0], [len(keep)], [0.5], np.ones(3, bool)):
+        with pytest.raises(ValueError, match="captures must be"):
+            fields.select(bad)
+
+
+def test_a_failed_capture_is_not_believed(bench):
+    """The second capture's images are another's: its pattern does not close, and its variance says so."""
+    images = bench.calibration.images
+    swapped = {n: np.array(getattr(images, n)) for n in ("radiance", "variance", "saturated")}
+    for stack in swapped.values():
+        stack[1] = stack[7]
+    failed = retrieve_fields(replace(bench.calibration, images=replace(images, **swapped)), METHOD)
+    usual = bench.calibration_fields
+    ratio = failed.variance.mean((1, 2)) / usual.variance.mean((1, 2))
+    assert np.all(ratio[:3] > 20)
+    assert np.all(ratio[3:] < 2)
