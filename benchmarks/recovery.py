@@ -28,7 +28,7 @@ import scipy.sparse.linalg
 import scipy.spatial
 from matplotlib.figure import Figure
 
-from acquisition import CalibrationPlan, CameraModel, SimulatedBench, Views
+from acquisition import Bracket, CalibrationPlan, CameraModel, SimulatedBench, Views
 from acquisition import Scene as BenchScene
 from benchmarks import live
 from benchmarks.results import Results
@@ -53,6 +53,7 @@ from polinfer import datasets, phantoms
 
 WAIST, NOISE, OUTSIDE = 2.5e-6, 0.02, 0.15
 CAMERA_PIXEL = 0.39e-6
+VIEWS = Views(tuple(np.linspace(-25e-6, 25e-6, 7).tolist()), bracket=Bracket(64e-3, 4.0, 1e-3))
 FEW = 22  # rows that spgl1 is asked for
 
 
@@ -219,7 +220,7 @@ def retrieved(results: Results, size: int | None) -> None:
                    reference=(0.0, radius - 5e-6), focus_error=3e-3, step_error=5e-3),
         rng=0,
     )  # fmt: skip
-    calibration = live.calibration(bench, replace(plan, views=Views(tuple(np.linspace(-25e-6, 25e-6, 7).tolist()))))
+    calibration = live.calibration(bench, replace(plan, views=VIEWS))
     start = time.perf_counter()
     fields = retrieve_fields(calibration, Modal(scene.fields.fibrelets), scene.fields.fibrelets, progress=True)
     middle = time.perf_counter()

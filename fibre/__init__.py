@@ -8,6 +8,7 @@ from .drift import Drift, track_drift
 from .fibrelets import find_fibrelets
 from .fields import retrieve_fields
 from .files import load
+from .imaging import TransmissionImage, transmission_image
 from .interference import relative_phase
 from .propagation import angular_spectrum
 from .reconstruction import reconstruct
@@ -25,7 +26,7 @@ from .records import (
     RetrievalStatus,
     Retrieved,
 )
-from .recovery.base import recover
+from .recovery.base import Cost, recover
 from .recovery.basis_pursuit import BasisPursuit
 from .recovery.denoise import DenoiseStatus, Solution, basis_pursuit_denoise
 from .recovery.forward_inverse import ForwardInverse
@@ -48,6 +49,7 @@ __all__ = [
     "Bundle",
     "Calibration",
     "CalibrationFields",
+    "Cost",
     "Defocus",
     "DenoiseStatus",
     "Diversity",
@@ -72,6 +74,7 @@ __all__ = [
     "Solution",
     "Staleness",
     "Transmission",
+    "TransmissionImage",
     "TransportOfIntensity",
     "WeightedSum",
     "angular_spectrum",
@@ -90,5 +93,6 @@ __all__ = [
     "save",
     "staleness",
     "track_drift",
+    "transmission_image",
     "update_matrix",
 ]

@@ -102,9 +102,10 @@ def retrieve_command(
 )
 @click.option("--window", type=float, help="Side of the window, micrometres; by default the method's own.")
 @click.option("--resume", "folder", type=_PATH, help="Keep finished rows in this folder, and go on from there.")
+@click.option("--cost", "only_cost", is_flag=True, help="Say what it will take, and stop.")
 @click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
 def recover_command(
-    fields: Path, out: Path, method: str, window: float | None, folder: Path | None, overwrite: bool
+    fields: Path, out: Path, method: str, window: float | None, folder: Path | None, only_cost: bool, overwrite: bool
 ) -> None:
     """Inverse transmission matrix from the calibration FIELDS, written to OUT.
 
@@ -119,7 +120,11 @@ def recover_command(
         "weighted-sum": WeightedSum,
     }
     chosen = kinds[method]() if window is None else kinds[method](window=window * 1e-6)
-    inverse = recover(_load(fields, (CalibrationFields,)), chosen, progress=True, folder=folder)
+    data = _load(fields, (CalibrationFields,))
+    click.echo(str(chosen.cost(data)))
+    if only_cost:
+        return
+    inverse = recover(data, chosen, progress=True, folder=folder)
     click.echo(f"wrote {save(inverse, out, overwrite=overwrite)}")
 
 

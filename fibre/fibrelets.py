@@ -193,7 +193,10 @@ def reference_region(power: np.ndarray) -> np.ndarray:
 
 
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
-    """Modes as columns over the pixels of a frame, sparse real (y x, m), each with a sum of squares of 1."""
+    """Modes as columns over the pixels of a frame, sparse real (y x, m), each with a sum of squares of 1.
+
+    Of a mode at the frame's edge that is the sum over the pixels beyond it too.
+    """
     reach = int(np.ceil(3 * fibrelets.mode_radius.max() / pixel_size))
     w = fibrelets.mode_radius[:, None]
     middle = (np.array(shape) - 1) / 2
@@ -202,7 +205,8 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     place = np.rint(pixel).astype(int)[:, None] + offset
     inside = ((place >= 0) & (place < np.array(shape))).all(-1)
     distance2 = ((place - pixel[:, None]) ** 2).sum(-1) * pixel_size**2
-    values = np.sqrt(2 / np.pi) * pixel_size / w * np.exp(-distance2 / w**2)
+    values = np.exp(-distance2 / w**2)
+    values /= np.sqrt((values**2).sum(1, keepdims=True))
     mode = np.broadcast_to(np.arange(len(pixel))[:, None], inside.shape)
     row = np.ravel_multi_index(tuple(place[inside].T), shape)
     return scipy.sparse.csr_array((values[inside], (row, mode[inside])), shape=(shape[0] * shape[1], len(pixel)))

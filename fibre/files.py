@@ -7,6 +7,7 @@ from typing import Any
 
 from fibre.bundle import Bundle
 from fibre.drift import Drift
+from fibre.imaging import TransmissionImage
 from fibre.records import (
     Calibration,
     CalibrationFields,
@@ -41,6 +42,7 @@ TYPES: tuple[type, ...] = (
     Registration,
     Retrieved,
     Staleness,
+    TransmissionImage,
 )
 
 

@@ -276,7 +276,10 @@ def logo(modulator: Modulator, text: str, height: float, spacing: float) -> np.n
     down = np.arange(0, box.height + 1e-9, spacing / scale) + box.y0
     across = np.arange(0, box.width + 1e-9, spacing / scale) + box.x0
     grid = np.stack([a.ravel() for a in np.meshgrid(across, down)], axis=1)
-    inside = grid[path.contains_points(grid, radius=1e-9)]
+    # a letter's hole is an outline inside of another: what lies in an odd number of them is ink
+    outlines = [Path(corners) for corners in path.to_polygons()]
+    ink = np.logical_xor.reduce([outline.contains_points(grid, radius=1e-9) for outline in outlines])
+    inside = grid[ink]
     points = np.stack([box.y0 + box.height / 2 - inside[:, 1], inside[:, 0] - box.x0 - box.width / 2], axis=1) * scale
     if len(points) == 0 or np.abs(points).max() > modulator.reach:
         raise ValueError(

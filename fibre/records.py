@@ -279,6 +279,23 @@ class Fibrelets:
         object.__setattr__(self, "centres", centres)
         object.__setattr__(self, "mode_radius", np.broadcast_to(radius, len(centres)).copy())
 
+    @classmethod
+    def pixels(cls, frame: tuple[int, int], pixel_size: float, rows: slice, columns: slice) -> Fibrelets:
+        """The pixel basis of a window: a "fibrelet" for every pixel of ``frame[rows, columns]``.
+
+        What the paper's recovery works in, and what is left where fibrelets cannot be told apart. Slices may have
+        steps. A window of a few thousand pixels is meant: every one of them costs what a fibrelet costs.
+
+        >>> Fibrelets.pixels((96, 96), 0.72e-6, slice(0, 2), slice(0, 4, 2)).centres.shape
+        (4, 2)
+        """
+        places = [np.arange(n)[s] - (n - 1) / 2 for n, s in zip(frame, (rows, columns), strict=True)]
+        centres = np.stack(np.meshgrid(*places, indexing="ij"), -1).reshape(-1, 2)
+        if len(centres) == 0:
+            raise ValueError(f"rows and columns must select pixels of the frame {frame}, got {rows} and {columns}.")
+        # narrow enough to belong to its own pixel alone
+        return cls(centres * real_number("pixel_size", pixel_size, above=0), 0.3 * pixel_size)
+
 
 @dataclass(frozen=True)
 class CalibrationFields:

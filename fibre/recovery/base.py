@@ -7,6 +7,7 @@ command.
 from __future__ import annotations
 
 import os
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -27,9 +28,30 @@ from polinfer.cluster import spread
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
 
-__all__ = ["RecoveryMethod", "RowByRow", "recover"]
+__all__ = ["Cost", "RecoveryMethod", "RowByRow", "recover"]
 
 PART = 64  # groups of points that are finished, and kept, together
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a recovery is going to take, found by doing a few of its rows.
+
+    rows: of A^-1, two a point. unknowns: mode amplitudes in a row, median over the points tried. equations: captures.
+    seconds: of all rows with the threads of this process. bytes: of the rows when they are stored.
+    """
+
+    rows: int
+    unknowns: int
+    equations: int
+    seconds: float
+    bytes: int
+
+    def __str__(self) -> str:
+        return (
+            f"{self.rows} rows of {self.unknowns} unknowns from {self.equations} captures: "
+            f"about {self.seconds:.2g} s, {self.bytes / 1e6:.3g} MB"
+        )
 
 
 class RecoveryMethod(ABC):
@@ -109,6 +131,26 @@ class RowByRow(RecoveryMethod):
     def groups(self, positions: np.ndarray) -> list[np.ndarray]:
         """Points that share a window, from where they are on the camera (p, 2); all p, each once."""
         return [np.array([point]) for point in range(len(positions))]
+
+    def cost(self, fields: CalibrationFields, tried: int = 8) -> Cost:
+        """What :func:`recover` will take: ``tried`` groups of points, evenly spread, are done and thrown away."""
+        start = time.perf_counter()
+        prepared, positions = self.prepared(fields), positions_on_camera(fields)
+        groups, usable, width = self.groups(positions), self.usable(prepared), self.width(fields)
+        tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
+        some = np.unique(np.linspace(0, len(groups) - 1, min(tried, len(groups))).astype(int))
+        tasks = [(groups[i], _within(tree, width, positions[groups[i]], groups[i], usable)) for i in some]
+        before = time.perf_counter() - start
+        self.rows(prepared, *tasks[0])  # what is done but once is not counted
+        start = time.perf_counter()
+        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(os.cpu_count()) as pool:
+            done = list(pool.map(lambda pair: self.rows(prepared, *pair), tasks))
+        each = (time.perf_counter() - start) / len(tasks)
+        unknowns = float(np.median([len(chosen) for _, chosen in tasks]))
+        # a complex number and its column index
+        size = np.mean([values.size / len(points) for (points, _), values in zip(tasks, done, strict=True)]) * 20
+        return Cost(2 * len(positions), int(unknowns), len(fields.fields), before + each * len(groups),
+                    int(size * len(positions)))  # fmt: skip
 
     def solve(
         self, fields: CalibrationFields, progress: bool, folder: str | Path | None = None, client: Any = None

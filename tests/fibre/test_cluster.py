@@ -33,7 +33,7 @@ class Broken(Ridge):
 @pytest.fixture(scope="module")
 def cluster():
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
+        n_workers=4, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
     ) as made:
         yield made
 
@@ -42,7 +42,7 @@ def cluster():
 def client(cluster, monkeypatch):
     monkeypatch.setattr(base, "PART", 8)
     with distributed.Client(cluster) as made:
-        made.wait_for_workers(2)
+        made.wait_for_workers(4)
         yield made
 
 

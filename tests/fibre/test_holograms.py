@@ -122,3 +122,10 @@ def test_a_logo_is_centred_and_as_tall_as_asked():
 def test_bad_input_is_named(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_letters_have_their_holes():
+    modulator = holograms.Modulator((512, 512), 12e-6, 850e-9, 0.2)
+    points = holograms.logo(modulator, "O", height=2e-3, spacing=5e-5)
+    assert len(points) > 100
+    assert np.hypot(*points.T).min() > 3e-4

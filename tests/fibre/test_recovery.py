@@ -1,5 +1,6 @@
 """A^-1 recovers fields it has not seen, as well as the noise of the calibration allows."""
 
+import time
 from dataclasses import replace
 from typing import ClassVar
 
@@ -7,8 +8,19 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fibre import BasisPursuit, ForwardInverse, Inverse, Ridge, WeightedSum, basis_pursuit_denoise, recover
+from fibre import (
+    BasisPursuit,
+    Fibrelets,
+    ForwardInverse,
+    Inverse,
+    Ridge,
+    WeightedSum,
+    basis_pursuit_denoise,
+    recover,
+    retrieve_fields,
+)
 from fibre.calibration import clean_fibrelets, columns
+from tests.fibre.benches import METHOD
 from tests.fibre.scenes import complex_noise, scene
 
 NOISE = 0.01
@@ -231,3 +243,33 @@ def test_an_interrupted_recovery_goes_on_where_it_was(tmp_path):
 def test_settings_out_of_range_are_named(call, text):
     with pytest.raises(ValueError, match=text):
         call()
+
+
+def test_the_cost_said_before_is_about_what_it_takes(standard):
+    """Counts exactly; seconds only as a number that can be believed within a factor of ten on a busy machine."""
+    fields, method = standard.calibration(0.01, 1), ForwardInverse()
+    cost = method.cost(fields)
+    start = time.perf_counter()
+    inverse = recover(fields, method)
+    spent = time.perf_counter() - start
+    assert cost.rows == inverse.matrix.shape[0]
+    assert cost.equations == len(fields.fields)
+    assert cost.bytes == pytest.approx(inverse.matrix.nnz * 20, rel=0.3)
+    assert spent / 10 < cost.seconds < 10 * spent
+    assert f"{cost.rows} rows" in str(cost)
+
+
+def test_a_window_of_pixels_recovers_what_fibrelets_do(bench):
+    """The same images kept in pixels of a window; the sample's fields come out alike, at the points in its middle."""
+    frame, size = bench.calibration.images.frame, bench.calibration.images.pixel_size
+    pixels = Fibrelets.pixels(frame, size, slice(20, 76, 2), slice(20, 76, 2))
+    fields = retrieve_fields(bench.calibration, METHOD, pixels)
+    recording = retrieve_fields(bench.recording, METHOD, pixels)
+    found, usual = (
+        recover(record, Ridge(window=16e-6)).matrix @ seen.reshape(3, -1).T
+        for record, seen in ((fields, recording.blank), (bench.calibration_fields, bench.recording_fields.blank))
+    )
+    middle = np.flatnonzero(np.tile(np.abs(bench.calibration.points).max(1) < 8e-6, 2))
+    turned = found * np.exp(1j * np.angle((found.conj() * usual).sum()))
+    error = np.linalg.norm((turned - usual)[middle]) / np.linalg.norm(usual[middle])
+    assert error < 0.1

@@ -78,3 +78,9 @@ def test_defocus_stack(tmp_path):
     assert len(scores) == 4
     assert all(score > bar for score, bar in zip(scores, (0.462, 0.690, 0.540, 0.447), strict=True))
     assert (tmp_path / "defocus-stack.png").stat().st_size > 10_000
+
+
+def test_letters_behind_a_fibre(tmp_path):
+    said = run("10_logo.py", tmp_path)
+    assert "amplitude of the letters 0.50" in said or "amplitude of the letters 0.49" in said
+    assert (tmp_path / "logo.png").stat().st_size > 10_000
