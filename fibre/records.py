@@ -294,7 +294,7 @@ class Fibrelets:
         if len(centres) == 0:
             raise ValueError(f"rows and columns must select pixels of the frame {frame}, got {rows} and {columns}.")
         # narrow enough to belong to its own pixel alone
-        return cls(centres * real_number("pixel_size", pixel_size, above=0), 0.3 * pixel_size)
+        return cls(centres * real_number("pixel_size", pixel_size, above=0), np.array(0.3 * pixel_size))
 
 
 @dataclass(frozen=True)
