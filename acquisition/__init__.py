@@ -2,7 +2,7 @@
 
 from .bench.scene import CameraModel, Scene
 from .bench.simulator import SimulatedBench
-from .contracts import Bench
+from .contracts import AnyBench as Bench
 from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
 from .plan import CalibrationPlan, GridPlan, PatternPlan, SamplePlan, Step, Timing, Views, elliptical_states
 from .run import calibrate, capture

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from acquisition.contracts import Bench
+from acquisition.contracts import AnyBench
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
@@ -20,7 +20,7 @@ from polinfer.checks import one_of_types
 __all__ = ["calibrate", "capture"]
 
 
-def calibrate(bench: Bench, plan: GridPlan, folder: str | Path, progress: bool = False) -> Calibration:
+def calibrate(bench: AnyBench, plan: GridPlan, folder: str | Path, progress: bool = False) -> Calibration:
     """Capture a calibration, or what is missing of it in ``folder``.
 
     Raises ValueError where the folder holds another plan's or another bench's run, TypeError for other plans.
@@ -39,7 +39,7 @@ def calibrate(bench: Bench, plan: GridPlan, folder: str | Path, progress: bool =
     )
 
 
-def capture(bench: Bench, plan: SamplePlan, folder: str | Path, progress: bool = False) -> Recording:
+def capture(bench: AnyBench, plan: SamplePlan, folder: str | Path, progress: bool = False) -> Recording:
     """Capture a sample with its blank and reference, or what is missing of them in ``folder``.
 
     Raises as :func:`calibrate`; ValueError for a plan without blank or reference, which a Recording needs.
@@ -55,7 +55,7 @@ def capture(bench: Bench, plan: SamplePlan, folder: str | Path, progress: bool =
     return Recording(parts["sample"], plan.illumination, parts["blank"], parts["reference"])
 
 
-def _execute(bench: Bench, plan: Plan, folder: str | Path, points: np.ndarray | None, progress: bool) -> Folder:
+def _execute(bench: AnyBench, plan: Plan, folder: str | Path, points: np.ndarray | None, progress: bool) -> Folder:
     store = Folder(folder, {"plan": plan.hash, "bench": bench.describe()})
     for step in tqdm(plan.captures, desc=type(plan).__name__, unit="capture", disable=not progress):
         if store.complete(step.id):
@@ -77,7 +77,7 @@ def _execute(bench: Bench, plan: Plan, folder: str | Path, points: np.ndarray | 
     return store
 
 
-def _images(bench: Bench, views: Views, store: Folder, steps: list[Step]) -> Images:
+def _images(bench: AnyBench, views: Views, store: Folder, steps: list[Step]) -> Images:
     identities = tuple(step.id for step in steps)
     frames, _ = store.load(identities[0])
     shape = (len(steps), len(views), *frames[0].shape[-2:])

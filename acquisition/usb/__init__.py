@@ -1,0 +1,1 @@
+"""Devices on USB, spoken to through pyusb."""
