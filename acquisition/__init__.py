@@ -1,30 +1,86 @@
-"""Capture: benches, plans, exposures, runs; and a bench that is simulated whole."""
+"""Capture: devices, benches, plans, exposures, runs; and a bench that is simulated whole."""
 
+from .bench.devices import Bench
 from .bench.scene import CameraModel, Scene
 from .bench.simulator import SimulatedBench
-from .contracts import AnyBench as Bench
+from .contracts import AnyBench, Camera, Device, Frame, Instrument, PhaseModulator, Shown
+from .display import DisplayModulator
+from .errors import (
+    AcquisitionError,
+    DeviceAbsent,
+    DeviceBusy,
+    DeviceForbidden,
+    DeviceLost,
+    DeviceRefused,
+    DeviceStalled,
+    DeviceTimeout,
+    FrameLost,
+    ProtocolError,
+    RunMismatch,
+    SettingError,
+)
 from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
 from .plan import CalibrationPlan, GridPlan, PatternPlan, SamplePlan, Step, Timing, Views, elliptical_states
 from .run import calibrate, capture
+from .settings import Setting, Written
+from .simulated import SimulatedCamera, SimulatedInstrument, SimulatedModulator
+from .usb.camera import Usb3VisionCamera
+from .usb.discovery import Found, list_devices
+from .usb.dlpc900 import Dlpc900Modulator
+from .usb.instrument import PowerMeter, Retarder, RotationMount, Scpi, UsbtmcInstrument
 
 __all__ = [
+    "AcquisitionError",
+    "AnyBench",
     "Bench",
     "Bracket",
     "CalibrationPlan",
+    "Camera",
     "CameraModel",
+    "Device",
+    "DeviceAbsent",
+    "DeviceBusy",
+    "DeviceForbidden",
+    "DeviceLost",
+    "DeviceRefused",
+    "DeviceStalled",
+    "DeviceTimeout",
+    "DisplayModulator",
+    "Dlpc900Modulator",
+    "Found",
+    "Frame",
+    "FrameLost",
     "GridPlan",
+    "Instrument",
     "InverseVariance",
     "LongestUnsaturated",
     "Merged",
     "PatternPlan",
+    "PhaseModulator",
+    "PowerMeter",
+    "ProtocolError",
+    "Retarder",
+    "RotationMount",
+    "RunMismatch",
     "SamplePlan",
     "Scene",
+    "Scpi",
+    "Setting",
+    "SettingError",
+    "Shown",
     "SimulatedBench",
+    "SimulatedCamera",
+    "SimulatedInstrument",
+    "SimulatedModulator",
     "Step",
     "Timing",
+    "Usb3VisionCamera",
+    "UsbtmcInstrument",
     "Views",
+    "Written",
     "calibrate",
     "capture",
     "elliptical_states",
+    "list_devices",
     "merge_exposures",
 ]

@@ -44,7 +44,7 @@ class SimulatedBench:
         self._sample = self._sample_field()
 
     def describe(self) -> dict[str, Any]:
-        """See :class:`acquisition.contracts.Bench`."""
+        """See :class:`acquisition.contracts.AnyBench`."""
         settings = {
             f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
         }
@@ -68,7 +68,7 @@ class SimulatedBench:
         return self._clock
 
     def continue_from(self, seconds: float) -> None:
-        """See :class:`acquisition.contracts.Bench`."""
+        """See :class:`acquisition.contracts.AnyBench`."""
         self._clock = max(self._clock, seconds)
 
     def drift(self, seconds: float) -> tuple[float, tuple[float, float]]:
@@ -82,7 +82,7 @@ class SimulatedBench:
         return float(scene.piston_walk * walk[0]), (float(scene.tilt_walk * walk[1]), float(scene.tilt_walk * walk[2]))
 
     def prepare(self, step: Step, views: Views, illumination: np.ndarray, points: np.ndarray | None) -> None:
-        """See :class:`acquisition.contracts.Bench`."""
+        """See :class:`acquisition.contracts.AnyBench`."""
         scene = self.scene
         state = illumination[:, step.state]
         spot = scene.bundle.launch(np.array([scene.reference]), scene.spot_waist)
@@ -102,7 +102,7 @@ class SimulatedBench:
         self._step, self._view = step, -1
 
     def expose(self, view: int, exposure: float) -> np.ndarray:
-        """See :class:`acquisition.contracts.Bench`."""
+        """See :class:`acquisition.contracts.AnyBench`."""
         if self._rates is None or self._step is None:
             raise RuntimeError("prepare a step before exposing.")
         camera = self.scene.camera
@@ -116,6 +116,9 @@ class SimulatedBench:
             electrons = electrons + camera.read_noise * generator.standard_normal(mean.shape, np.float32)
         counts = np.clip(np.rint(electrons / camera.gain), 0, camera.full_scale)
         return counts.astype(np.uint8 if camera.bits <= 8 else np.uint16)
+
+    def make_safe(self) -> None:
+        """See :class:`acquisition.contracts.AnyBench`: there is no light to turn off."""
 
     def _sample_field(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Jones matrices on the grid, and places, light, Jones matrices and spot size of the finer sample."""

@@ -4,8 +4,9 @@ In: XML bytes from the device and a port to its registers. Out: :class:`Features
 access. Called by the camera's driver. The XML is untrusted: no entities, no document types, bounded size, depth and
 number of nodes; its formulas are parsed by us.
 
-Node types: Category, Integer, IntReg, MaskedIntReg, Float, FloatReg, StringReg, Register, Boolean, Enumeration, Command,
-Converter, IntConverter, SwissKnife, IntSwissKnife, Port; StructReg, ports within chunks, and events are not read.
+Node types: Category, Integer, IntReg, MaskedIntReg, Float, FloatReg, StringReg, Register, Boolean, Enumeration,
+Command, Converter, IntConverter, SwissKnife, IntSwissKnife, Port; StructReg, ports within chunks, and events are not
+read.
 """
 
 from __future__ import annotations
@@ -316,6 +317,8 @@ class Features:
             return self._unit(self._node(below))
 
     def _node(self, name: str) -> Element:
+        if name not in self.nodes and self._depth > 1:
+            return self._referred(name)
         if name not in self.nodes:
             raise SettingError(f"name must be a feature of the camera, got {str(name)[:80]!r}.")
         return self.nodes[name]
@@ -354,7 +357,7 @@ class Features:
                 return self._from_register(node)
             if tag == "FloatReg":
                 raw = self._bytes(node)
-                value = float(struct.unpack(self._order(node) + {4: "f", 8: "d"}[len(raw)], raw)[0])
+                value = float(struct.unpack(self._order(node) + self._float_code(name, len(raw)), raw)[0])
                 if not math.isfinite(value):
                     raise ProtocolError(f"{name} is {value} in the device.")
                 return value
@@ -396,9 +399,7 @@ class Features:
             if tag in ("IntReg", "MaskedIntReg"):
                 self._to_register(node, int(value))
             elif tag == "FloatReg":
-                code = {4: "f", 8: "d"}.get(self._length(node))
-                if code is None:
-                    raise ProtocolError(f"{name} is a floating register of {self._length(node)} bytes.")
+                code = self._float_code(name, self._length(node))
                 self.port.write(self._address(node), struct.pack(self._order(node) + code, value))
             elif tag in ("Converter", "IntConverter"):
                 found = self._formula(name, node, "FormulaTo")(self._variables(node) | {"FROM": value})
@@ -451,6 +452,12 @@ class Features:
         return found
 
     # registers
+
+    @staticmethod
+    def _float_code(name: str, length: int) -> str:
+        if length not in (4, 8):
+            raise ProtocolError(f"{name[:80]} is a floating register of {length} bytes.")
+        return "f" if length == 4 else "d"
 
     def _order(self, node: Element) -> str:
         return ">" if _text(node, "Endianess") == "BigEndian" else "<"

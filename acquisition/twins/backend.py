@@ -47,8 +47,9 @@ class TwinBackend(usb.backend.IBackend):
 
     def get_device_descriptor(self, dev: UsbModel) -> Any:
         found = _structure(dev.descriptor, "<BBHBBBBHHHBBBB",
-                           "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol bMaxPacketSize0 "
-                           "idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber bNumConfigurations")  # fmt: skip
+                           "bLength bDescriptorType bcdUSB bDeviceClass bDeviceSubClass bDeviceProtocol "
+                           "bMaxPacketSize0 idVendor idProduct bcdDevice iManufacturer iProduct iSerialNumber "
+                           "bNumConfigurations")  # fmt: skip
         found.address, found.bus, found.port_number = 1 + self.models.index(dev), 1, 1
         found.port_numbers, found.speed = (1,), None
         return found

@@ -12,6 +12,8 @@ import struct
 import zipfile
 from collections import deque
 from collections.abc import Callable
+from importlib import resources
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -95,9 +97,9 @@ class CameraTwin(UsbModel):
 
     def _fill(self, code: int, xml: bytes | None, zipped: bool) -> None:
         self._put(0x000, struct.pack("<I", 0x00010000))
-        for address, text in ((0x004, "polinfer"), (0x044, "Camera twin"), (0x084, "twins"), (0x0C4, "1.0"),
+        for address, name in ((0x004, "polinfer"), (0x044, "Camera twin"), (0x084, "twins"), (0x0C4, "1.0"),
                               (0x104, "in software"), (0x144, self.serial), (0x184, "")):  # fmt: skip
-            self._put(address, text.encode().ljust(64, b"\0"))
+            self._put(address, name.encode().ljust(64, b"\0"))
         self._put(0x1C4, struct.pack("<QIQQ", 0, 200, MANIFEST, SBRM))
         self._put(0x1E0, bytes(0x30))
         self._put(0x1FC, struct.pack("<QI", 1, 0))
@@ -235,7 +237,7 @@ class CameraTwin(UsbModel):
         pending = struct.pack("<IHHHHHH", 0x43563355, 0, 0x0805, 4, request, 0, 100)
         if fault == "late acknowledgement":
             self._late.append(answer)
-        changed = {
+        changed: dict[str, list[Any]] = {
             "no acknowledgement": [],
             "late acknowledgement": [],
             "pending": [pending, answer],
@@ -252,11 +254,11 @@ class CameraTwin(UsbModel):
             "empty": [b""],
             "stall": [Stall],
             "overflow": [Overflow],
-            "unplug": [None],
-        }[fault]
+            "unplug": [],
+        }
         if fault == "unplug":
             self.plugged = False
-        return changed
+        return changed[fault]
 
     def answer(self, address: int, length: int) -> bytes:
         """See :class:`UsbModel`."""
@@ -320,7 +322,7 @@ class CameraTwin(UsbModel):
         rows, columns, y, x, code = (self.register(n) for n in ("height", "width", "y", "x", "format"))
         counts = self.scene(exposure, block)[y : y + rows, x : x + columns]
         raw = np.ascontiguousarray(counts, dtype="u1" if FORMATS[code][0] == 1 else "<u2")
-        pixels = memoryview(raw).cast("B")
+        pixels = raw.data.cast("B")
         began = int(self.clock * 1e9)
         self.clock += exposure
         kind, height = (0x4001 if fault == "chunks" else 1), (0x7FFFFFFF if fault == "absurd size" else rows)
@@ -383,93 +385,15 @@ REGISTERS = {
 }  # fmt: skip
 
 
-def _integer(name: str, register: str, low: str, high: str, step: int = 1, lock: bool = True) -> str:
-    locked = "<pIsLocked>TLParamsLocked</pIsLocked>" if lock else ""
-    return (
-        f'<Integer Name="{name}">{locked}<pValue>{name}Reg</pValue>{low}{high}<Inc>{step}</Inc></Integer>'
-        f'<IntReg Name="{name}Reg"><Address>{REGISTERS[register]:#x}</Address><Length>4</Length>'
-        "<AccessMode>RW</AccessMode><pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>LittleEndian</Endianess>"
-        "</IntReg>"
-    )
-
-
-def _choice(name: str, register: str, entries: dict[str, int], lock: bool = False) -> str:
-    locked = "<pIsLocked>TLParamsLocked</pIsLocked>" if lock else ""
-    inside = "".join(f'<EnumEntry Name="{key}"><Value>{value}</Value></EnumEntry>' for key, value in entries.items())
-    return (
-        f'<Enumeration Name="{name}">{locked}{inside}<pValue>{name}Reg</pValue></Enumeration>'
-        f'<IntReg Name="{name}Reg"><Address>{REGISTERS[register]:#x}</Address><Length>4</Length>'
-        "<AccessMode>RW</AccessMode><pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>LittleEndian</Endianess>"
-        "</IntReg>"
-    )
-
-
-def _command(name: str, register: str) -> str:
-    return (
-        f'<Command Name="{name}"><pValue>{name}Reg</pValue><CommandValue>1</CommandValue></Command>'
-        f'<IntReg Name="{name}Reg"><Address>{REGISTERS[register]:#x}</Address><Length>4</Length>'
-        "<AccessMode>WO</AccessMode><pPort>Device</pPort><Sign>Unsigned</Sign><Endianess>LittleEndian</Endianess>"
-        "</IntReg>"
-    )
-
-
 def camera_xml(sensor: tuple[int, int], trigger: bool) -> bytes:
     """The camera's own description of its features, with every node type that we read."""
+    folder = resources.files("acquisition.twins")
     rows, columns = sensor
-    features = ["DeviceVendorName", "DeviceModelName", "Width", "Height", "OffsetX", "OffsetY", "WidthMax", "HeightMax",
-                "PixelFormat", "PayloadSize", "ExposureTime", "Gain", "ReverseX", "TestPattern", "DeviceUserID",
-                "DeviceTemperature", "AcquisitionMode", "AcquisitionStart", "AcquisitionStop"]  # fmt: skip
-    triggers = ""
-    if trigger:
-        features += ["TriggerSelector", "TriggerMode", "TriggerSource", "TriggerSoftware"]
-        triggers = (
-            _choice("TriggerSelector", "selector", {"FrameStart": 0})
-            + _choice("TriggerMode", "trigger_mode", {"Off": 0, "On": 1})
-            + _choice("TriggerSource", "source", {"Software": 0})
-            + _command("TriggerSoftware", "trigger")
-        )
-    root = "".join(f"<pFeature>{name}</pFeature>" for name in features)
-    port = "<pPort>Device</pPort>"
-    little = "<Endianess>LittleEndian</Endianess>"
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<RegisterDescription ModelName="CameraTwin" VendorName="polinfer" ToolTip="A camera in software"
- StandardNameSpace="None" SchemaMajorVersion="1" SchemaMinorVersion="1" SchemaSubMinorVersion="0" MajorVersion="1"
- MinorVersion="0" SubMinorVersion="0" ProductGuid="2f5c4b1e-6c8c-4a44-9d7e-1d1f6f3f0a01"
- VersionGuid="7f1a4b6e-2c1c-4d55-8b0a-5e6c1b2d3f02" xmlns="http://www.genicam.org/GenApi/Version_1_1"
- xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
- xsi:schemaLocation="http://www.genicam.org/GenApi/Version_1_1 GenApiSchema_Version_1_1.xsd">
-<Category Name="Root" NameSpace="Standard">{root}</Category>
-<StringReg Name="DeviceVendorName"><Address>0x4</Address><Length>64</Length><AccessMode>RO</AccessMode>{port}</StringReg>
-<StringReg Name="DeviceModelName"><Address>0x44</Address><Length>64</Length><AccessMode>RO</AccessMode>{port}</StringReg>
-<StringReg Name="DeviceUserID"><Address>{REGISTERS["user"]:#x}</Address><Length>16</Length><AccessMode>RW</AccessMode>{port}</StringReg>
-{_integer("Width", "width", "<Min>16</Min>", "<pMax>WidthMax</pMax>", 16)}
-{_integer("Height", "height", "<Min>2</Min>", "<pMax>HeightMax</pMax>")}
-{_integer("OffsetX", "x", "<Min>0</Min>", "<pMax>OffsetXMax</pMax>")}
-{_integer("OffsetY", "y", "<Min>0</Min>", "<pMax>OffsetYMax</pMax>")}
-<IntSwissKnife Name="WidthMax"><pVariable Name="X">OffsetXReg</pVariable><Formula>{columns} - X</Formula></IntSwissKnife>
-<IntSwissKnife Name="HeightMax"><pVariable Name="Y">OffsetYReg</pVariable><Formula>{rows} - Y</Formula></IntSwissKnife>
-<IntSwissKnife Name="OffsetXMax"><pVariable Name="W">WidthReg</pVariable><Formula>{columns} - W</Formula></IntSwissKnife>
-<IntSwissKnife Name="OffsetYMax"><pVariable Name="H">HeightReg</pVariable><Formula>{rows} - H</Formula></IntSwissKnife>
-{_choice("PixelFormat", "format", {"Mono8": 0x01080001, "Mono10": 0x01100003, "Mono12": 0x01100005, "Mono16": 0x01100007}, True)}
-<IntSwissKnife Name="PayloadSize"><pVariable Name="W">WidthReg</pVariable><pVariable Name="H">HeightReg</pVariable>
-<pVariable Name="F">PixelFormatReg</pVariable><Formula>W * H * (((F &gt;&gt; 16) &amp; 0xFF) / 8)</Formula></IntSwissKnife>
-<Float Name="ExposureTime"><pValue>ExposureConverter</pValue><Unit>us</Unit><Representation>PureNumber</Representation></Float>
-<Converter Name="ExposureConverter"><FormulaTo>FROM</FormulaTo><FormulaFrom>TO</FormulaFrom><pValue>ExposureTicks</pValue><Slope>Increasing</Slope></Converter>
-<Integer Name="ExposureTicks"><pValue>ExposureReg</pValue><Min>10</Min><Max>10000000</Max></Integer>
-<IntReg Name="ExposureReg"><Address>{REGISTERS["exposure"]:#x}</Address><Length>4</Length><AccessMode>RW</AccessMode>{port}<Sign>Unsigned</Sign>{little}</IntReg>
-<Float Name="Gain"><pValue>GainReg</pValue><Min>0</Min><Max>24</Max><Unit>dB</Unit></Float>
-<FloatReg Name="GainReg"><Address>{REGISTERS["gain"]:#x}</Address><Length>4</Length><AccessMode>RW</AccessMode>{port}{little}</FloatReg>
-<Boolean Name="ReverseX"><pValue>ReverseXBit</pValue></Boolean>
-<MaskedIntReg Name="ReverseXBit"><Address>{REGISTERS["flags"]:#x}</Address><Length>4</Length><AccessMode>RW</AccessMode>{port}<Bit>3</Bit><Sign>Unsigned</Sign>{little}</MaskedIntReg>
-<Integer Name="TestPattern"><pValue>TestPatternBits</pValue></Integer>
-<MaskedIntReg Name="TestPatternBits"><Address>{REGISTERS["flags"]:#x}</Address><Length>4</Length><AccessMode>RW</AccessMode>{port}<LSB>8</LSB><MSB>11</MSB><Sign>Unsigned</Sign>{little}</MaskedIntReg>
-<SwissKnife Name="DeviceTemperature"><pVariable Name="RAW">TemperatureReg</pVariable><Formula>RAW / 100</Formula></SwissKnife>
-<IntReg Name="TemperatureReg"><Address>{REGISTERS["temperature"]:#x}</Address><Length>4</Length><AccessMode>RO</AccessMode>{port}<Sign>Signed</Sign>{little}</IntReg>
-{_choice("AcquisitionMode", "mode", {"Continuous": 0, "SingleFrame": 1})}
-{_command("AcquisitionStart", "start")}
-{_command("AcquisitionStop", "stop")}
-{triggers}
-{_integer("TLParamsLocked", "locked", "<Min>0</Min>", "<Max>1</Max>", lock=False)}
-<Port Name="Device" NameSpace="Standard"/>
-</RegisterDescription>
-""".encode()
+    names = ("TriggerSelector", "TriggerMode", "TriggerSource", "TriggerSoftware") if trigger else ()
+    text = Template(folder.joinpath("camera.xml").read_text()).substitute(
+        rows=rows,
+        columns=columns,
+        trigger_features="".join(f"<pFeature>{name}</pFeature>" for name in names),
+        triggers=folder.joinpath("camera-trigger.xml").read_text() if trigger else "",
+    )
+    return text.encode()

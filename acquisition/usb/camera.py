@@ -92,7 +92,7 @@ class Usb3VisionCamera(Camera):
         response = self.control.number(u3v.ABRM["response"], 4) / 1000
         sbrm = self.control.number(u3v.ABRM["sbrm"], 8)
         largest = [self.control.number(sbrm + u3v.SBRM[name], 4) for name in ("command", "acknowledge")]
-        self.control.limits(*largest, response)
+        self.control.limits(largest[0], largest[1], response)
         if not self.control.number(sbrm + u3v.SBRM["capability"], 8) & 1:
             raise ProtocolError(f"{self._port.name} states no stream.")
         self._sirm = self.control.number(sbrm + u3v.SBRM["sirm"], 8)
@@ -109,7 +109,7 @@ class Usb3VisionCamera(Camera):
         self._triggered = self._arm()
 
     def _interfaces(self) -> tuple[Any, Any]:
-        found = {}
+        found: dict[int, Any] = {}
         try:
             for one in self._port.device.get_active_configuration():
                 if (one.bInterfaceClass, one.bInterfaceSubClass) == CLASS:

@@ -128,7 +128,7 @@ class Control:
 
     def _transact(self, kind: int, payload: bytes, repeat: bool) -> bytes:
         failed: AcquisitionError = DeviceTimeout(f"{self.port.name}: no acknowledgement.")
-        for _ in range(ATTEMPTS if repeat else 1):
+        for _ in range(ATTEMPTS):
             self._request = self._request % 0xFFFF + 1
             try:
                 self.port.write(self._out, command(kind, self._request, payload), self.response_time)
@@ -137,12 +137,13 @@ class Control:
                 if error.status not in AGAIN:
                     raise
                 failed = error
-            except DeviceStalled as error:
-                failed = error
-                self.port.clear_halt(self._out)
-                self.port.clear_halt(self._into)
             except (DeviceTimeout, ProtocolError) as error:
                 failed = error
+                if isinstance(error, DeviceStalled):
+                    self.port.clear_halt(self._out)
+                    self.port.clear_halt(self._into)
+                if not repeat:  # it may have been done: only what was refused as busy is certain not to have been
+                    break
         raise failed
 
     def _answer(self, kind: int) -> bytes:

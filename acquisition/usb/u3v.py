@@ -128,7 +128,7 @@ class Leader:
     padding: int
 
 
-def leader(raw: bytes) -> Leader:
+def leader(raw: bytes | memoryview) -> Leader:
     """A frame's leader; FrameLost where it is not one of an image."""
     if len(raw) < LEADER_SIZE:
         raise FrameLost(f"a leader of {len(raw)} bytes where {LEADER_SIZE} must be.")
@@ -152,7 +152,7 @@ class Trailer:
     height: int
 
 
-def trailer(raw: bytes) -> Trailer:
+def trailer(raw: bytes | memoryview) -> Trailer:
     """A frame's trailer; FrameLost where it is not one."""
     if len(raw) < TRAILER_SIZE:
         raise FrameLost(f"a trailer of {len(raw)} bytes where {TRAILER_SIZE} must be.")

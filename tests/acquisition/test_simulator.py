@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acquisition import Bench, Bracket, CameraModel, Scene, SimulatedBench, Step, Views
+from acquisition import AnyBench, Bracket, CameraModel, Scene, SimulatedBench, Step, Views
 from fibre import Bundle
 from polinfer import RetarderFirst, phantoms
 from tests.acquisition.benches import BUNDLE, CAMERA, PLAN, SAMPLE, SCENE, VIEWS, bench
@@ -151,7 +151,7 @@ def test_a_finer_sample_of_a_flat_scene_makes_the_same_field():
 
 def test_the_bench_keeps_the_contract_and_describes_itself_in_json():
     b = bench()
-    assert isinstance(b, Bench)
+    assert isinstance(b, AnyBench)
     described = b.describe()
     assert json.loads(json.dumps(described)) == described == bench().describe()
     before = b.time()
