@@ -43,6 +43,7 @@ class InstrumentTwin(UsbModel):
         self._message = bytearray()
         self._text: deque[bytes] = deque()
         self._sent: deque[Any] = deque()
+        self._events: deque[bytes] = deque()
         self._aborted = False
 
     def received(self, address: int, data: bytes) -> None:
@@ -137,19 +138,21 @@ class InstrumentTwin(UsbModel):
             "short": [header()[:5]],
             "size too large": [header(size=len(text) + 40) + text],
             "absurd size": [header(size=0xFFFFFFF0) + text],
-            "in packets": [header(size=len(text)) + text[:3], text[3:]],
+            "in packets": [header() + text[:1], text[1:]],
             "not text": [header() + bytes(range(len(text)))],
             "no number": [header(size=4) + b"abc\n"],
             "endless": [header(end=0) + text],
             "empty": [b""],
             "stall": [Stall],
             "overflow": [Overflow],
-            "unplug": [NoData],
+            "unplug": [],
         }
         return answers[fault]
 
     def answer(self, address: int, length: int) -> bytes:
         """See :class:`UsbModel`."""
+        if address == EVENTS and self._events:
+            return self._events.popleft()
         if address != INTO or not self._sent:
             raise NoData
         what = self._sent.popleft()
@@ -186,6 +189,8 @@ class InstrumentTwin(UsbModel):
         if request == 7:
             return struct.pack("<BxHBB6xHBB8x", 1, 0x0100, 0, 0, 0x0100, 4, 0)
         if request == 128:
+            # with an interrupt endpoint the byte comes there
+            self._events.append(bytes([0x80 | value & 0x7F, 0]))
             return bytes([1, value & 0x7F, 0])
         if request in (64, 160, 161, 162):
             return b"\x01"

@@ -276,7 +276,7 @@ class UsbtmcInstrument(Instrument):
         if c.kind == "action":
             self.write(c.command)
         elif c.kind in ("number", "integer"):
-            self.write(f"{c.command} {value / c.scale!r}")
+            self.write(f"{c.command} {value / c.scale:.12g}")
         else:
             self.write(f"{c.command} {int(value) if c.kind == 'switch' else value}")
         self._settle()
