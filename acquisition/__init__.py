@@ -20,6 +20,7 @@ from .errors import (
     SettingError,
 )
 from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
+from .photons import PhotonTransfer, photon_transfer
 from .plan import CalibrationPlan, GridPlan, PatternPlan, SamplePlan, Step, Timing, Views, elliptical_states
 from .run import calibrate, capture
 from .settings import Setting, Written
@@ -57,6 +58,7 @@ __all__ = [
     "Merged",
     "PatternPlan",
     "PhaseModulator",
+    "PhotonTransfer",
     "PowerMeter",
     "ProtocolError",
     "Retarder",
@@ -83,4 +85,5 @@ __all__ = [
     "elliptical_states",
     "list_devices",
     "merge_exposures",
+    "photon_transfer",
 ]

@@ -54,8 +54,8 @@ class Acknowledge:
 def command(kind: int, request: int, payload: bytes) -> bytes:
     """A command that wants an acknowledgement.
 
-    >>> command(READ, 1, bytes(12)).hex()
-    '5533564300400008' '0c000100' '000000000000000000000000'
+    >>> command(READ, 1, bytes(12)).hex(" ")[:35]
+    '55 33 56 43 00 40 00 08 0c 00 01 00'
     """
     return struct.pack("<IHHHH", MAGIC, 0x4000, kind, len(payload), request) + payload
 

@@ -6,11 +6,11 @@ import pytest
 from acquisition import Bracket, InverseVariance, LongestUnsaturated, merge_exposures
 
 GAIN, READ, DARK, FULL = 2.0, 3.0, 20.0, 4095
-TIMES = 0.1 / 2.0 ** np.arange(6)
-# four decades; none so dark that the cut at zero counts is felt, none whose noise straddles saturation
-RADIANCE = np.array([200.0, 1e3, 3e3, 3e4, 1.1e5, 2.2e5, 4.5e5, 1.8e6])
+TIMES = 0.1 / 2.0 ** np.arange(9)
+# five decades; none so dark that the cut at zero counts is felt, none whose noise straddles saturation
+RADIANCE = np.array([200.0, 1e3, 3e3, 3e4, 1.1e5, 2.2e5, 4.5e5, 1.8e6, 1.4e7, 2.0e7])
 RULES = [InverseVariance(GAIN, READ, DARK), LongestUnsaturated(GAIN, READ, DARK)]
-COUNT = 4000
+COUNT = 16000
 
 
 def frames(radiance, rng):
@@ -45,14 +45,14 @@ def test_radiance_is_unbiased_and_its_variance_true_over_decades(rule):
 
 def test_inverse_variance_reaches_the_cramer_rao_bound():
     error, found = merged(RULES[0])
-    np.testing.assert_allclose((error**2).mean(1), cramer_rao(), rtol=0.1)
+    np.testing.assert_allclose((error**2).mean(1), cramer_rao(), rtol=0.05)
     np.testing.assert_allclose(found.variance.mean(1), cramer_rao(), rtol=0.02)
 
 
 def test_inverse_variance_is_never_worse_than_the_longest_unsaturated():
     best, longest = ((merged(rule)[0] ** 2).mean(1) for rule in RULES)
     assert np.all(best < 1.07 * longest)  # sampling error of either: 2 %
-    assert np.all(best[1:-1] < 0.65 * longest[1:-1])  # a bracket of factor 2 has twice the light of its longest
+    assert np.all(best[1:-2] < 0.65 * longest[1:-2])  # a bracket of factor 2 has twice the light of its longest
 
 
 def test_where_noise_straddles_saturation_the_bias_is_a_fraction_of_the_noise():
