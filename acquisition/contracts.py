@@ -197,8 +197,8 @@ class AnyBench(Protocol):
     def prepare(self, step: Step, views: Views, illumination: np.ndarray, points: np.ndarray | None) -> None:
         """Show the step's pattern and place the sample; returns when both have settled."""
 
-    def expose(self, view: int, exposure: float) -> np.ndarray:
-        """One raw frame (y, x) of counts of the given view of the prepared step; exposure in seconds."""
+    def expose(self, view: int, exposure: float) -> Frame:
+        """One raw frame of the given view of the prepared step, begun after the call; exposure in seconds."""
 
     def time(self) -> float:
         """Seconds on a monotonic clock."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from acquisition.errors import RunMismatch
 from acquisition.exposure import Merged, MergeRule, merge_exposures
 
 __all__ = ["Folder", "MergedStack"]
@@ -32,15 +33,20 @@ class Folder:
         self.manifest = self.path / MANIFEST
         self.done: dict[str, dict[str, Any]] = {}
         lines = self._read()
+        self.lines = 0
         if not lines:
             self._append(header)
             return
         if lines[0] != header:
             differing = sorted(k for k in {*lines[0], *header} if lines[0].get(k) != header.get(k))
-            raise ValueError(
+            raise RunMismatch(
                 f"folder {self.path} belongs to another run ({', '.join(differing)} differ); choose another folder."
             )
-        self.done = {line["id"]: line for line in lines[1:]}
+        for line in lines[1:]:
+            self.done.pop(line["id"], None)  # what was taken again counts from then
+            if not line.get("void"):
+                self.done[line["id"]] = line
+        self.lines = len(lines) - 1
 
     def _read(self) -> list[dict[str, Any]]:
         if not self.manifest.exists():
@@ -56,7 +62,9 @@ class Folder:
         except ValueError as error:  # not JSON, or not even text
             raise ValueError(f"folder {self.path} has a damaged {MANIFEST} ({error}); it cannot be resumed.") from error
         parts = {"id", "bytes", "sha256", "exposures", "time", "ended"}
-        if not all(isinstance(line, dict) for line in lines) or any(not parts <= line.keys() for line in lines[1:]):
+        if not all(isinstance(line, dict) for line in lines) or any(
+            not (parts <= line.keys() or {"id", "void"} <= line.keys()) for line in lines[1:]
+        ):
             raise ValueError(f"folder {self.path} has a foreign {MANIFEST}; choose another folder.")
         return lines
 
@@ -74,10 +82,23 @@ class Folder:
         finally:
             os.close(descriptor)
 
+    def void(self, identity: str) -> None:
+        """A capture that does not count any more, although its frames are there: it is to be taken again."""
+        self._append({"id": identity, "void": True})
+        self.lines += 1
+        self.done.pop(identity, None)
+
     def store(
-        self, identity: str, frames: list[np.ndarray], exposures: list[list[float]], time: float, ended: float
+        self,
+        identity: str,
+        frames: list[np.ndarray],
+        exposures: list[list[float]],
+        time: float,
+        ended: float,
+        **more: Any,
     ) -> None:
-        """Keep a capture from ``time`` to ``ended``: ``frames[i]`` are the raw exposures (k, y, x) of image i."""
+        """Keep a capture from ``time`` to ``ended``: ``frames[i]`` are the raw exposures (k, y, x) of image i,
+        ``exposures[i]`` seconds, as the camera says they were; ``more`` goes into the manifest, as JSON."""
         name = f"{identity}.npz"
         part = self.path / f".{name}.part"
         with open(part, "wb") as file:
@@ -90,8 +111,9 @@ class Folder:
         os.replace(part, self.path / name)
         self._sync_directory()
         line = {"id": identity, "file": name, "bytes": size, "sha256": digest, "exposures": exposures, "time": time,
-                "ended": ended}  # fmt: skip
+                "ended": ended, **more}  # fmt: skip
         self._append(line)
+        self.lines += 1
         self.done[identity] = line
 
     def load(self, identity: str) -> tuple[list[np.ndarray], list[list[float]]]:

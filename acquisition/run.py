@@ -7,39 +7,57 @@ capture whose frames are complete in the folder is not taken again.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from acquisition.contracts import AnyBench
+from acquisition.contracts import AnyBench, Frame
+from acquisition.errors import AcquisitionError
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
-from polinfer.checks import one_of_types
+from polinfer.checks import one_of_types, real_number
 
 __all__ = ["calibrate", "capture"]
 
 
-def calibrate(bench: AnyBench, plan: GridPlan, folder: str | Path, progress: bool = False) -> Calibration:
+def calibrate(
+    bench: AnyBench,
+    plan: GridPlan,
+    folder: str | Path,
+    progress: bool = False,
+    reference_seconds: float | None = None,
+) -> Calibration:
     """Capture a calibration, or what is missing of it in ``folder``.
 
-    Raises ValueError where the folder holds another plan's or another bench's run, TypeError for other plans.
+    A run that was cut off begins again with a reference, and what lies after its last reference is taken again: drift
+    is never interpolated over the gap. ``reference_seconds``: take a further reference where the last is older than
+    that (the paper's 60 s); None: those of the plan only. On every way out the bench is made safe.
+
+    Raises RunMismatch (a ValueError) where the folder holds another plan's or another bench's run, TypeError for
+    other plans.
     """
     one_of_types("plan", plan, (GridPlan,), "pass CalibrationPlan(...) or PatternPlan(...).")
-    store = _execute(bench, plan, folder, plan.points, progress)
+    store = _execute(bench, plan, folder, plan.points, progress, reference_seconds)
     spots = [step for step in plan.captures if step.kind == "spots"]
-    references = [step for step in plan.captures if step.kind == "reference"]
     return Calibration(
-        _images(bench, plan.views, store, spots),
+        _images(bench, plan.views, store, [step.id for step in spots]),
         plan.inputs,
         plan.points,
         plan.grid,
-        _images(bench, plan.views, store, references),
+        _images(bench, plan.views, store, _references(store)),
         bench.registration,
     )
 
 
-def capture(bench: AnyBench, plan: SamplePlan, folder: str | Path, progress: bool = False) -> Recording:
+def capture(
+    bench: AnyBench,
+    plan: SamplePlan,
+    folder: str | Path,
+    progress: bool = False,
+    reference_seconds: float | None = None,
+) -> Recording:
     """Capture a sample with its blank and reference, or what is missing of them in ``folder``.
 
     Raises as :func:`calibrate`; ValueError for a plan without blank or reference, which a Recording needs.
@@ -47,40 +65,111 @@ def capture(bench: AnyBench, plan: SamplePlan, folder: str | Path, progress: boo
     one_of_types("plan", plan, (SamplePlan,), "pass SamplePlan(...).")
     if not plan.blank or plan.references < 1:
         raise ValueError("plan must have a blank and a reference to make a Recording; it has not.")
-    store = _execute(bench, plan, folder, None, progress)
+    store = _execute(bench, plan, folder, None, progress, reference_seconds)
     parts = {
-        kind: _images(bench, plan.views, store, [step for step in plan.captures if step.kind == kind])
-        for kind in ("sample", "blank", "reference")
+        kind: _images(bench, plan.views, store, [step.id for step in plan.captures if step.kind == kind])
+        for kind in ("sample", "blank")
     }
-    return Recording(parts["sample"], plan.illumination, parts["blank"], parts["reference"])
+    references = _images(bench, plan.views, store, _references(store))
+    return Recording(parts["sample"], plan.illumination, parts["blank"], references)
 
 
-def _execute(bench: AnyBench, plan: Plan, folder: str | Path, points: np.ndarray | None, progress: bool) -> Folder:
+def _references(store: Folder) -> list[str]:
+    """All of them, those that an interruption or the clock has added too, in the order of their times."""
+    found = [identity for identity in store.done if identity.startswith("reference")]
+    return sorted(found, key=lambda identity: store.done[identity]["time"])
+
+
+def _execute(
+    bench: AnyBench, plan: Plan, folder: str | Path, points: np.ndarray | None, progress: bool, every: float | None
+) -> Folder:
+    if every is not None:
+        real_number("reference_seconds", every, above=0)
     store = Folder(folder, {"plan": plan.hash, "bench": bench.describe()})
-    for step in tqdm(plan.captures, desc=type(plan).__name__, unit="capture", disable=not progress):
-        if store.complete(step.id):
-            bench.continue_from(store.done[step.id]["ended"])
-            continue
-        bench.prepare(step, plan.views, plan.illumination, points)
-        started = bench.time()
-        frames, exposures = [], []
-        for view in range(len(plan.views)):
-            stack, times = [], []
-            for exposure in plan.views.bracket.times():
-                stack.append(bench.expose(view, exposure))
-                times.append(exposure)
-                if stack[-1].max() < bench.full_scale:
-                    break
-            frames.append(np.stack(stack))
-            exposures.append(times)
-        store.store(step.id, frames, exposures, started, bench.time())
+    if store.done:
+        bench.continue_from(max(line["ended"] for line in store.done.values()))
+    steps = _to_be_taken(plan, store)
+    bar = tqdm(total=len(plan.captures), desc=type(plan).__name__, unit="capture", disable=not progress)
+    bar.update(max(len(plan.captures) - len(steps), 0))
+    last: float | None = None  # when the last reference of this segment was finished
+    segment = 1 + max((line.get("segment", 0) for line in store.done.values()), default=-1)
+    try:
+        for step in steps:
+            since = None if last is None else bench.time() - last
+            if every is not None and since is not None and since > every and step.kind != "reference":
+                extra = Step(_fresh(store, "reference-clock"), "reference")
+                _take(bench, plan, extra, points, store, segment=segment, late=since - every)
+                last = bench.time()
+            _take(bench, plan, step, points, store, segment=segment)
+            if step.kind == "reference":
+                last = bench.time()
+            bar.update()
+    except BaseException as error:
+        try:
+            bench.make_safe()
+        except AcquisitionError as failed:
+            error.add_note(f"and the bench could not be made safe: {failed}")
+        raise
+    finally:
+        bar.close()
+    bench.make_safe()
     return store
 
 
-def _images(bench: AnyBench, views: Views, store: Folder, steps: list[Step]) -> Images:
-    identities = tuple(step.id for step in steps)
+def _to_be_taken(plan: Plan, store: Folder) -> list[Step]:
+    """What is missing. Where something is there already, a reference comes first, and what was taken after the last
+    reference of before is taken again: drift is not to be interpolated over the gap."""
+    steps = list(plan.captures)
+    missing = [step for step in steps if not store.complete(step.id)]
+    if not missing or not store.done:
+        return missing
+    closes = steps[-1].kind == "reference"
+    order = list(store.done)
+    if closes:
+        last = max((i for i, identity in enumerate(order) if identity.startswith("reference")), default=-1)
+        for identity in order[last + 1 :]:
+            store.void(identity)
+        missing = [step for step in steps if not store.complete(step.id)]
+    if any(step.kind == "reference" for step in steps):
+        if missing[0].kind != "reference":
+            missing.insert(0, Step(_fresh(store, "reference-again"), "reference"))
+        if closes and missing[-1].kind != "reference":
+            missing.append(Step(_fresh(store, "reference-after"), "reference"))
+    return missing
+
+
+def _fresh(store: Folder, name: str) -> str:
+    """A name that no line of the manifest can have: lines are never removed."""
+    return f"{name}-{store.lines}"
+
+
+def _take(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, store: Folder, **more: Any) -> None:
+    """One capture: all exposures of all its views, then on the disk."""
+    bench.prepare(step, plan.views, plan.illumination, points)
+    started = bench.time()
+    images: list[list[Frame]] = []
+    for view in range(len(plan.views)):
+        images.append([])
+        for exposure in plan.views.bracket.times():
+            images[-1].append(bench.expose(view, exposure))
+            if images[-1][-1].counts.max() < bench.full_scale:
+                break
+    store.store(
+        step.id,
+        [np.stack([frame.counts for frame in image]) for image in images],
+        [[frame.exposure for frame in image] for image in images],
+        started,
+        bench.time(),
+        blocks=[[frame.block for frame in image] for image in images],
+        saturated=[[int((frame.counts >= bench.full_scale).sum()) for frame in image] for image in images],
+        **more,
+    )
+
+
+def _images(bench: AnyBench, views: Views, store: Folder, names: list[str]) -> Images:
+    identities = tuple(names)
     frames, _ = store.load(identities[0])
-    shape = (len(steps), len(views), *frames[0].shape[-2:])
+    shape = (len(identities), len(views), *frames[0].shape[-2:])
     cache: dict = {}
     radiance, variance, saturated = (
         MergedStack(store, identities, bench.full_scale, bench.merge_rule, shape, part, cache)

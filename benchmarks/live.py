@@ -35,7 +35,7 @@ class _Live:
             for view in range(len(self.plan.views)):
                 frames, times = [], []
                 for exposure in self.plan.views.bracket.times():
-                    frames.append(bench.expose(view, exposure))
+                    frames.append(bench.expose(view, exposure).counts)
                     times.append(exposure)
                     if frames[-1].max() < bench.full_scale:
                         break

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.contracts import Camera, Device, PhaseModulator
+from acquisition.contracts import Camera, Device, Frame, PhaseModulator
 from acquisition.errors import AcquisitionError, SettingError
 from acquisition.exposure import MergeRule
 from acquisition.plan import Step, Views
@@ -106,7 +106,7 @@ class Bench:
             self.modulators["illumination"].show(self._illuminate(step, illumination, points))
         self._view, self._views = None, views
 
-    def expose(self, view: int, exposure: float) -> np.ndarray:
+    def expose(self, view: int, exposure: float) -> Frame:
         """See :class:`acquisition.contracts.AnyBench`."""
         if self._views is None:
             raise SettingError("prepare a step before exposing.")
@@ -114,7 +114,7 @@ class Bench:
             assert self._analyse is not None
             self.modulators["analysis"].show(self._analyse(view, self._views))
         self._view = view
-        return self.camera.snap(exposure).counts
+        return self.camera.snap(exposure)
 
     def time(self) -> float:
         """See :class:`acquisition.contracts.AnyBench`."""

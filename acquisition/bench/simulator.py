@@ -11,6 +11,7 @@ import numpy as np
 import scipy.ndimage
 
 from acquisition.bench.scene import Scene
+from acquisition.contracts import Frame
 from acquisition.exposure import InverseVariance, MergeRule
 from acquisition.plan import Step, Views
 from polinfer import RetarderFirst
@@ -40,7 +41,7 @@ class SimulatedBench:
         self.registration = np.array([[1.0, 0, 0], [0, 1.0, 0]])
         self._step: Step | None = None
         self._rates: np.ndarray | None = None
-        self._clock, self._view = 0.0, -1
+        self._clock, self._view, self._block = 0.0, -1, -1
         self._sample = self._sample_field()
 
     def describe(self) -> dict[str, Any]:
@@ -101,11 +102,12 @@ class SimulatedBench:
         self._rates = self._views(scene.bundle.transmit(launched) * turned, views, step)
         self._step, self._view = step, -1
 
-    def expose(self, view: int, exposure: float) -> np.ndarray:
+    def expose(self, view: int, exposure: float) -> Frame:
         """See :class:`acquisition.contracts.AnyBench`."""
         if self._rates is None or self._step is None:
             raise RuntimeError("prepare a step before exposing.")
         camera = self.scene.camera
+        began, self._block = self._clock, self._block + 1
         self._clock += exposure + (self.scene.image_time if view != self._view else 0.0)
         self._view = view
         mean = self._rates[view] * exposure
@@ -115,7 +117,7 @@ class SimulatedBench:
         if camera.read_noise:
             electrons = electrons + camera.read_noise * generator.standard_normal(mean.shape, np.float32)
         counts = np.clip(np.rint(electrons / camera.gain), 0, camera.full_scale)
-        return counts.astype(np.uint8 if camera.bits <= 8 else np.uint16)
+        return Frame(counts.astype(np.uint8 if camera.bits <= 8 else np.uint16), self._block, began, exposure)
 
     def make_safe(self) -> None:
         """See :class:`acquisition.contracts.AnyBench`: there is no light to turn off."""

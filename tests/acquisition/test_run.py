@@ -1,14 +1,28 @@
 """A run can be cut off anywhere and resumed: nothing is lost, nothing taken twice, nothing foreign believed."""
 
 import hashlib
+import itertools
 import json
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, calibrate, capture, merge_exposures
+from acquisition import (
+    CalibrationPlan,
+    DeviceLost,
+    Frame,
+    InverseVariance,
+    SamplePlan,
+    SimulatedBench,
+    calibrate,
+    capture,
+    merge_exposures,
+)
 from acquisition.recording import Folder
+from acquisition.run import _execute
 from fibre import Calibration, Recording
 from tests.acquisition.benches import PLAN, SAMPLE, SCENE, VIEWS, bench
 
@@ -34,7 +48,15 @@ class Flaky:
 
 
 def raw_files(folder):
-    return {path.name: path.read_bytes() for path in folder.glob("*.npz")}
+    """Those of the plan; references that an interruption has added are apart."""
+    return {p.name: p.read_bytes() for p in folder.glob("*.npz") if not p.name.startswith(ADDED)}
+
+
+def added(folder):
+    return sorted(p.stem for p in folder.glob("*.npz") if p.name.startswith(ADDED))
+
+
+ADDED = ("reference-again", "reference-after", "reference-clock")
 
 
 @pytest.fixture(scope="module")
@@ -80,22 +102,157 @@ def test_an_interrupted_run_resumes_with_the_same_bytes_and_takes_nothing_twice(
     second = Flaky(bench())
     resumed = calibrate(second, PLAN, tmp_path)
     assert raw_files(tmp_path) == raw_files(folder)
-    # what was complete is not exposed again; only the capture in hand when it broke is
-    assert not any(f"{step}.npz" in kept for step, _, _ in second.exposed)
-    assert len(first.exposed) + len(second.exposed) <= len(exposed) + 3 * len(VIEWS)
+    # what was complete before the last reference is not exposed again; only what lies after it is
+    done = [step.id for step in PLAN.captures if f"{step.id}.npz" in kept]
+    last = max((i for i, name in enumerate(done) if name.startswith("reference")), default=-1)
+    assert not {step for step, _, _ in second.exposed} & set(done[: last + 1])
+    assert {step for step, _, _ in second.exposed} >= set(done[last + 1 :])
+    # a reference comes first
+    assert second.exposed[0][0].startswith("reference")
+    assert resumed.references.captures == record.references.captures + len(added(tmp_path))
+    assert np.all(np.diff(resumed.references.times) > 0)
     np.testing.assert_array_equal(np.asarray(resumed.images.radiance), np.asarray(record.images.radiance))
     np.testing.assert_array_equal(resumed.images.times.shape, record.images.times.shape)
 
 
-def test_a_resumed_run_meets_the_drift_that_it_would_have_met(tmp_path):
+def test_a_resumed_run_never_interpolates_drift_over_the_gap(tmp_path):
+    """Between any capture and the references around it lies no interruption."""
     moving = replace(SCENE, piston_walk=0.3, tilt_walk=2e4, image_time=1.0)
-    whole = calibrate(SimulatedBench(moving, rng=1), PLAN, tmp_path / "whole")
     with pytest.raises(Interrupted):
-        calibrate(Flaky(SimulatedBench(moving, rng=1), limit=40), PLAN, tmp_path / "parts")
-    parts = calibrate(SimulatedBench(moving, rng=1), PLAN, tmp_path / "parts")
-    assert raw_files(tmp_path / "parts") == raw_files(tmp_path / "whole")
-    np.testing.assert_array_equal(parts.images.times, whole.images.times)
-    assert np.all(np.diff(whole.images.times) > len(VIEWS))
+        calibrate(Flaky(SimulatedBench(moving, rng=1), limit=40), PLAN, tmp_path)
+    record = calibrate(SimulatedBench(moving, rng=1), PLAN, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "manifest.jsonl").read_text().splitlines()[1:]]
+    valid = {}
+    for line in lines:
+        valid.pop(line["id"], None)
+        if not line.get("void"):
+            valid[line["id"]] = line
+    order = sorted(valid.values(), key=lambda line: line["time"])
+    assert {line["segment"] for line in order} == {0, 1}
+    for before, after in itertools.pairwise(order):
+        if before["segment"] != after["segment"]:
+            assert before["id"].startswith("reference")
+            assert after["id"].startswith("reference")
+    assert order[0]["id"].startswith("reference")
+    assert order[-1]["id"].startswith("reference")
+    assert len(record.references.times) == len(added(tmp_path)) + sum(s.kind == "reference" for s in PLAN.captures)
+
+
+def test_a_reference_is_taken_when_the_last_is_too_old(tmp_path):
+    slow = replace(SCENE, image_time=1.0)
+    record = calibrate(SimulatedBench(slow, rng=1), PLAN, tmp_path, reference_seconds=12.0)
+    extra = [name for name in added(tmp_path) if name.startswith("reference-clock")]
+    assert extra
+    times = np.sort(np.concatenate([record.references.times, record.images.times]))
+    gaps = np.diff(record.references.times)
+    assert gaps.max() < 12.0 + 2 * np.diff(times).max()
+    with pytest.raises(ValueError, match="reference_seconds"):
+        calibrate(bench(), PLAN, tmp_path / "b", reference_seconds=0.0)
+
+
+def test_the_bench_is_made_safe_on_every_way_out(tmp_path):
+    class Watched(Flaky):
+        safe = 0
+
+        def make_safe(self):
+            self.safe += 1
+
+    good = Watched(bench())
+    capture(good, SAMPLE, tmp_path / "good")
+    assert good.safe == 1
+    bad = Watched(bench(), limit=5)
+    with pytest.raises(Interrupted):
+        capture(bad, SAMPLE, tmp_path / "bad")
+    assert bad.safe == 1
+
+    class Dark(Flaky):
+        def make_safe(self):
+            raise DeviceLost("the laser does not answer")
+
+    with pytest.raises(Interrupted) as caught:
+        capture(Dark(bench(), limit=5), SAMPLE, tmp_path / "dark")
+    assert "laser" in caught.value.__notes__[0]
+    with pytest.raises(DeviceLost):
+        capture(Dark(bench()), SAMPLE, tmp_path / "dark")
+
+
+class Quick:
+    """A bench that costs nothing: every frame says which it is."""
+
+    wavelength, pixel_size, full_scale = 850e-9, 1e-6, 255
+    merge_rule, registration = InverseVariance(1.0, 1.0), np.eye(2, 3)
+
+    def __init__(self):
+        self.clock, self.step = 0.0, None
+
+    def describe(self):
+        return {"bench": "quick"}
+
+    def prepare(self, step, views, illumination, points):
+        self.step = step
+
+    def expose(self, view, exposure):
+        self.clock += exposure
+        number = int(hashlib.sha256(f"{self.step.id}|{view}|{exposure}".encode()).hexdigest(), 16)
+        return Frame(np.full((2, 3), number % 250, np.uint8), 0, self.clock, exposure)
+
+    def time(self):
+        return self.clock
+
+    def continue_from(self, seconds):
+        self.clock = max(self.clock, seconds)
+
+    def make_safe(self):
+        pass
+
+
+def killed_at(point, after, folder):
+    """A run in a process of its own that is killed at its ``point``-th fsync, before or after it; False: it ended."""
+    child = os.fork()
+    if child == 0:
+        real, count = os.fsync, 0
+
+        def fsync(descriptor):
+            nonlocal count
+            if count == point and not after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            real(descriptor)
+            if count == point and after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            count += 1
+
+        os.fsync = fsync
+        try:
+            _execute(Quick(), PLAN, folder, PLAN.points, False, None)
+        finally:
+            os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*")
+@pytest.mark.parametrize("after", [False, True])
+def test_killed_at_any_fsync_nothing_is_lost_and_nothing_doubled(after, tmp_path):
+    """Killed at its first fsync, resumed, killed at its second, and so on, and each time from the beginning too."""
+    points = range(10) if os.environ.get("POLINFER_KILLS") is None else range(130)
+    kills, survivor = 0, tmp_path / "one after the other"
+    for point in points:
+        for folder in (tmp_path / f"at {point}", survivor):
+            kills += killed_at(point, after, folder)
+    assert kills >= len(points)
+    for folder in [*(tmp_path / f"at {point}" for point in points), survivor]:
+        store = _execute(Quick(), PLAN, folder, PLAN.points, False, None)
+        assert {step.id for step in PLAN.captures} <= set(store.done)
+        for identity in store.done:
+            frames, exposures = store.load(identity)  # checks the hash
+            assert len(frames) == len(VIEWS)
+            for view, (stack, times) in enumerate(zip(frames, exposures, strict=True)):
+                for frame, exposure in zip(stack, times, strict=True):
+                    number = int(hashlib.sha256(f"{identity}|{view}|{exposure}".encode()).hexdigest(), 16)
+                    assert np.all(frame == number % 250)
+        lines = [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()[1:]]
+        current = [line["id"] for line in lines if not line.get("void")]
+        voided = [line["id"] for line in lines if line.get("void")]
+        assert sorted(current) == sorted([*store.done, *voided])  # every capture counts once
 
 
 def test_many_interruptions_are_survived(whole, tmp_path):
@@ -130,9 +287,11 @@ def test_a_torn_last_line_is_dropped_and_that_capture_retaken(whole, cut, tmp_pa
     manifest.write_bytes(manifest.read_bytes()[:-cut])
     again = Flaky(bench())
     calibrate(again, PLAN, tmp_path)
-    assert {step for step, _, _ in again.exposed} == {PLAN.captures[-1].id}
+    # with what lies after the reference before it
+    last = max(i for i, step in enumerate(PLAN.captures[:-1]) if step.kind == "reference")
+    again_for = {step.id for step in PLAN.captures[last + 1 :]}
+    assert {step for step, _, _ in again.exposed} - set(added(tmp_path)) == again_for
     assert raw_files(tmp_path) == raw_files(whole[0])
-    assert len(manifest.read_text().splitlines()) == len(PLAN.captures) + 1
     assert all(json.loads(line) for line in manifest.read_text().splitlines())
 
 
@@ -164,7 +323,8 @@ def test_a_file_of_another_size_or_a_missing_one_is_taken_again(whole, tmp_path)
     (tmp_path / f"{gone}.npz").unlink()
     again = Flaky(bench())
     calibrate(again, PLAN, tmp_path)
-    assert {step for step, _, _ in again.exposed} == {cut, gone}
+    assert {step for step, _, _ in again.exposed} == {cut, gone, *added(tmp_path)}
+    assert [name.rsplit("-", 1)[0] for name in added(tmp_path)] == ["reference-after", "reference-again"]
     assert raw_files(tmp_path) == raw_files(whole[0])
 
 
