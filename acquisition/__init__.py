@@ -21,7 +21,18 @@ from .errors import (
 )
 from .exposure import Bracket, InverseVariance, LongestUnsaturated, Merged, merge_exposures
 from .photons import PhotonTransfer, photon_transfer
-from .plan import CalibrationPlan, GridPlan, PatternPlan, SamplePlan, Step, Timing, Views, elliptical_states
+from .plan import (
+    CalibrationPlan,
+    GridPlan,
+    PatternPlan,
+    SamplePlan,
+    Step,
+    Timing,
+    Upgrade,
+    Views,
+    elliptical_states,
+    upgrades,
+)
 from .run import calibrate, capture
 from .settings import Setting, Written
 from .simulated import SimulatedCamera, SimulatedInstrument, SimulatedModulator
@@ -76,6 +87,7 @@ __all__ = [
     "SimulatedModulator",
     "Step",
     "Timing",
+    "Upgrade",
     "Usb3VisionCamera",
     "UsbtmcInstrument",
     "Views",
@@ -86,4 +98,5 @@ __all__ = [
     "list_devices",
     "merge_exposures",
     "photon_transfer",
+    "upgrades",
 ]

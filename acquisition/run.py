@@ -6,6 +6,7 @@ capture whose frames are complete in the folder is not taken again.
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,15 @@ import numpy as np
 from tqdm import tqdm
 
 from acquisition.contracts import AnyBench, Frame
-from acquisition.errors import AcquisitionError
+from acquisition.errors import AcquisitionError, DeviceLost, DeviceTimeout, FrameLost
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
 from polinfer.checks import one_of_types, real_number
 
 __all__ = ["calibrate", "capture"]
+
+WAITS = (0.5, 2.0, 5.0)  # seconds before a capture is taken anew
 
 
 def calibrate(
@@ -98,9 +101,9 @@ def _execute(
             since = None if last is None else bench.time() - last
             if every is not None and since is not None and since > every and step.kind != "reference":
                 extra = Step(_fresh(store, "reference-clock"), "reference")
-                _take(bench, plan, extra, points, store, segment=segment, late=since - every)
+                _surely(bench, plan, extra, points, store, segment=segment, late=since - every)
                 last = bench.time()
-            _take(bench, plan, step, points, store, segment=segment)
+            _surely(bench, plan, step, points, store, segment=segment)
             if step.kind == "reference":
                 last = bench.time()
             bar.update()
@@ -141,6 +144,17 @@ def _to_be_taken(plan: Plan, store: Folder) -> list[Step]:
 def _fresh(store: Folder, name: str) -> str:
     """A name that no line of the manifest can have: lines are never removed."""
     return f"{name}-{store.lines}"
+
+
+def _surely(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, store: Folder, **more: Any) -> None:
+    """One capture, taken anew where a frame or a device was lost on the way."""
+    for wait in WAITS:
+        try:
+            _take(bench, plan, step, points, store, **more)
+            return
+        except (DeviceLost, DeviceTimeout, FrameLost):
+            time.sleep(wait)
+    _take(bench, plan, step, points, store, **more)
 
 
 def _take(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, store: Folder, **more: Any) -> None:

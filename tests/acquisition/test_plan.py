@@ -5,7 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acquisition import Bracket, CalibrationPlan, PatternPlan, SamplePlan, Timing, Views, elliptical_states
+from acquisition import (
+    Bracket,
+    CalibrationPlan,
+    PatternPlan,
+    SamplePlan,
+    Timing,
+    Views,
+    elliptical_states,
+    upgrades,
+)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 7])
@@ -176,3 +185,38 @@ def test_patterns_are_lit_in_every_state_and_follow_the_seed():
 def test_wrong_settings_of_patterns_are_named(change, text):
     with pytest.raises(ValueError, match=text):
         PatternPlan(**change)
+
+
+def test_the_papers_times_and_what_its_upgrades_buy():
+    """Its own numbers (24.9 s, 40.5 and 50.8 min), and the errata's: 0.50 s and 92 s, 0.17 s and 20 to 24 s."""
+    plan = CalibrationPlan((27, 36), stride=9, reference_every=5)
+    assert len(plan.captures) == 293
+    assert plan.duration(Timing()) / 60 == pytest.approx(40.5, abs=0.05)
+    table = {u.name: u for u in upgrades()}
+    published = table["as published"]
+    assert published.sample == pytest.approx(24.9)
+    assert published.calibration / 60 == pytest.approx(50.8)
+    together = table["all three"]
+    assert together.sample == pytest.approx(0.503, abs=0.001)
+    assert together.calibration == pytest.approx(92.4, abs=0.1)
+    bound = table["only the 60 Hz modulator binds"]
+    assert bound.sample == pytest.approx(1 / 6)
+    assert bound.calibration == pytest.approx(24.4, abs=0.05)
+    assert table["the same without reference captures"].calibration == pytest.approx(20.25)
+    claimed = [u for u in upgrades() if u.claim is not None]
+    assert all(published.sample / u.sample == pytest.approx(u.claim) for u in claimed)
+
+
+def test_a_duration_is_made_of_its_parts():
+    bracket = Bracket(0.08, 2.0, 0.02)
+    timing = Timing.of_parts(bracket, modulator_rate=50.0, settle=0.1, camera_rate=20.0, overhead=5.0)
+    assert timing.image == pytest.approx(0.02 + 0.1 + 0.08 + 0.05 + 0.05)
+    assert Timing.of_parts(bracket, exposures=1).image == pytest.approx(1 / 60 + 0.08)
+    plan = SamplePlan(references=1)
+    assert plan.duration(timing) == pytest.approx(7 * 11 * timing.image + 5)
+    for change, name in (({"modulator_rate": 0}, "modulator_rate"), ({"settle": -1}, "settle"),
+                         ({"exposures": 0}, "exposures")):  # fmt: skip
+        with pytest.raises(ValueError, match=name):
+            Timing.of_parts(bracket, **change)
+    with pytest.raises(ValueError, match="image"):
+        Timing(image=0.0)

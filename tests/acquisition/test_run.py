@@ -176,6 +176,27 @@ def test_the_bench_is_made_safe_on_every_way_out(tmp_path):
         capture(Dark(bench()), SAMPLE, tmp_path / "dark")
 
 
+def test_a_capture_in_which_a_device_was_lost_is_taken_anew(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr("acquisition.run.WAITS", (0.0, 0.0))
+
+    class Loose(Flaky):
+        losses = 2
+
+        def expose(self, view, exposure):
+            if self.losses and len(self.exposed) == 17:
+                self.losses -= 1
+                raise DeviceLost("unplugged")
+            return super().expose(view, exposure)
+
+    calibrate(Loose(bench()), PLAN, tmp_path / "twice")
+    assert raw_files(tmp_path / "twice") == raw_files(whole[0])
+    often = Loose(bench())
+    often.losses = 10
+    with pytest.raises(DeviceLost):
+        calibrate(often, PLAN, tmp_path / "often")
+    assert often.losses == 7
+
+
 class Quick:
     """A bench that costs nothing: every frame says which it is."""
 
