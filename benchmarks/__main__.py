@@ -29,6 +29,7 @@ ALL = (
     "texture",
     "contrast",
     "cohort_contrast",
+    "acquisition",
     "accelerator",
 )
 

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import jax
+from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 # The library never decides about precision; its tests run in double unless told otherwise.
@@ -18,3 +19,9 @@ jax.config.update("jax_disable_most_optimizations", os.environ.get("POLINFER_TES
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+# Random input: some 2,000 examples of the parsers in every run, more than 100,000 with POLINFER_FUZZ=fuzz. A machine
+# with other work on it is slow now and then, which is no failure.
+settings.register_profile("quick", deadline=None, max_examples=150)
+settings.register_profile("fuzz", deadline=None, max_examples=8000)
+settings.load_profile(os.environ.get("POLINFER_FUZZ", "quick"))
