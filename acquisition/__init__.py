@@ -33,9 +33,11 @@ from .plan import (
     elliptical_states,
     upgrades,
 )
+from .reporting import write_report
 from .run import calibrate, capture
 from .settings import Setting, Written
 from .simulated import SimulatedCamera, SimulatedInstrument, SimulatedModulator
+from .streaming import FibreImager, Imager, StreamedFrame, stream
 from .usb.camera import Usb3VisionCamera
 from .usb.discovery import Found, list_devices
 from .usb.dlpc900 import Dlpc900Modulator
@@ -59,10 +61,12 @@ __all__ = [
     "DeviceTimeout",
     "DisplayModulator",
     "Dlpc900Modulator",
+    "FibreImager",
     "Found",
     "Frame",
     "FrameLost",
     "GridPlan",
+    "Imager",
     "Instrument",
     "InverseVariance",
     "LongestUnsaturated",
@@ -86,6 +90,7 @@ __all__ = [
     "SimulatedInstrument",
     "SimulatedModulator",
     "Step",
+    "StreamedFrame",
     "Timing",
     "Upgrade",
     "Usb3VisionCamera",
@@ -98,5 +103,7 @@ __all__ = [
     "list_devices",
     "merge_exposures",
     "photon_transfer",
+    "stream",
     "upgrades",
+    "write_report",
 ]

@@ -1,4 +1,4 @@
-"""Commands that this package adds to ``polinfer``: demo, devices, acquire."""
+"""Commands that this package adds to ``polinfer``: demo, devices, acquire, report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-__all__ = ["acquire_command", "demo_command", "devices_command"]
+__all__ = ["acquire_command", "demo_command", "devices_command", "report_command"]
 
 
 @click.command("demo")
@@ -17,20 +17,47 @@ def demo_command(folder: Path, seed: int) -> None:
     """Run the whole instrument on a simulated bench and compare with the truth; records go to FOLDER.
 
     Camera frames are simulated, merged, phase-retrieved, sent through the recovered inverse of the fibre and fitted.
-    About a minute on two cores and 150 MB of disk.
+    A report.html shows maps, posteriors, the verdict on the ordering and texture. About a minute on two cores and
+    150 MB of disk.
 
     Example: polinfer demo my-demo --seed 3
     """
     from acquisition.demo import report, run_demo
 
     click.echo(f"Writing to {folder.resolve()}")
-    result = run_demo(folder, seed, progress=True)
+    result = run_demo(folder, seed, progress=True, page=True)
     click.echo("\nSeconds by stage: " + ", ".join(f"{name} {value:.1f}" for name, value in result.seconds.items()))
     click.echo(f"Total {sum(result.seconds.values()):.0f} s\n")
     report(result, click.echo)
     click.echo("\nWrote, beside the raw frames:")
     for path in result.files:
         click.echo(f"  {path}")
+
+
+@click.command("report")
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="The page; by default FOLDER/report.html.")
+@click.option("--title", default="Polarisation of a sample", show_default=True)
+@click.option("--pixel-size", type=float, help="Micrometres between pixels, for scale bars.")
+@click.option(
+    "--simulations", type=click.IntRange(min=0), default=40, show_default=True, help="For the power; 0: none."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+def report_command(
+    folder: Path, out: Path | None, title: str, pixel_size: float | None, simulations: int, seed: int
+) -> None:
+    """Write one page about the sample in FOLDER (measurement.nc and fit.nc): maps, uncertainty, verdict, provenance.
+
+    Example: polinfer report my-demo --pixel-size 4.2
+    """
+    from acquisition.reporting import write_report
+
+    try:
+        size = None if pixel_size is None else pixel_size * 1e-6
+        path = write_report(folder, out, title, pixel_size=size, simulations=simulations, rng=seed)
+    except (FileNotFoundError, TypeError, ValueError) as error:
+        raise click.ClickException(str(error)) from error
+    click.echo(f"wrote {path}")
 
 
 @click.command("devices")

@@ -19,6 +19,7 @@ import polinfer
 from acquisition.bench.scene import Scene
 from acquisition.bench.simulator import SimulatedBench
 from acquisition.plan import CalibrationPlan, SamplePlan
+from acquisition.reporting import write_report
 from acquisition.run import calibrate, capture
 from polinfer import ComplexGain, Fit, Measurement, Model, Parameters, RetarderFirst, phantoms
 from polinfer.degeneracy import nearest
@@ -67,9 +68,11 @@ def demo_scene(seed: int, grid: tuple[int, int] = GRID) -> Scene:
     )
 
 
-def run_demo(folder: str | Path, seed: int = 0, progress: bool = False, grid: tuple[int, int] = GRID) -> DemoResult:
+def run_demo(
+    folder: str | Path, seed: int = 0, progress: bool = False, grid: tuple[int, int] = GRID, page: bool = False
+) -> DemoResult:
     """Simulate, capture, retrieve, recover, reconstruct and fit a sample of ``grid`` points; every record is saved in
-    ``folder``.
+    ``folder``. ``page``: write a report too, with posteriors, the comparison of the orderings, and texture.
 
     Captures already complete in ``folder`` are not taken again; everything later is made anew and overwritten.
     """
@@ -114,7 +117,21 @@ def run_demo(folder: str | Path, seed: int = 0, progress: bool = False, grid: tu
     with stage("picture"):
         files.append(folder / "maps.png")
         fit.plot().savefig(files[-1], dpi=110)
-    return DemoResult(scene.phantom, measurement, fit, seconds, files)
+    result = DemoResult(scene.phantom, measurement, fit, seconds, files)
+    if page:
+        with stage("report"):
+            files.append(_page(result, folder, scene.pitch, seed))
+    return result
+
+
+def _page(result: DemoResult, folder: Path, pitch: float, seed: int) -> Path:
+    chi_square, freedom, pixels = result.chi_square
+    note = (
+        f"A lesion behind a simulated fibre, scene {seed}. Against the truth, the fitted Jones matrices have a chi-square "
+        f"of {chi_square / freedom:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is as stated."
+    )
+    seconds, title = result.seconds, "polinfer demo"
+    return write_report(folder, title=title, seconds=seconds, pixel_size=pitch, rng=seed, notes=(note,))
 
 
 def report(result: DemoResult, echo: Callable[[str], None]) -> None:

@@ -6,7 +6,7 @@ from . import holograms
 from .bundle import Bundle
 from .drift import Drift, track_drift
 from .fibrelets import find_fibrelets
-from .fields import retrieve_fields
+from .fields import retrieve_fields, retrieve_sample
 from .files import load
 from .imaging import TransmissionImage, transmission_image
 from .interference import relative_phase
@@ -89,6 +89,7 @@ __all__ = [
     "relative_phase",
     "retrieve",
     "retrieve_fields",
+    "retrieve_sample",
     "rows_from_intensities",
     "save",
     "staleness",

@@ -35,7 +35,7 @@ from polinfer.checks import one_of_types
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
 
-__all__ = ["fibrelets_of", "pattern_groups", "retrieve_fields"]
+__all__ = ["fibrelets_of", "pattern_groups", "retrieve_fields", "retrieve_sample"]
 
 APART = 5.0  # fibrelets between neighbouring spots, from which on the light of each is closed by itself
 
@@ -236,6 +236,40 @@ def retrieve_fields(
         fields.status,
         blank.status,
         noise.stray,
+    )
+
+
+def retrieve_sample(
+    images: Images, method: RetrievalMethod, calibration_fields: CalibrationFields, before: RecordingFields
+) -> RecordingFields:
+    """Fields of the next frame of a series: the sample alone is retrieved, its blank is that of ``before``.
+
+    As :func:`retrieve_fields` of a recording, with the reference spot of the calibration for that of the recording, and
+    the noise from the closure of the sample's states alone. A fibre that has moved since needs a new recording; the
+    piston between the frames and the blank is not known.
+
+    images: n captures, in the states of ``before``. method: for instance ``Modal(calibration_fields.fibrelets)``.
+
+    Raises TypeError for other records, ValueError for another number of captures.
+    """
+    one_of_types("images", images, (Images,), "pass the captured Images.")
+    one_of_types("calibration_fields", calibration_fields, (CalibrationFields,), "make them with retrieve_fields.")
+    one_of_types("before", before, (RecordingFields,), "make them with retrieve_fields(recording).")
+    states = before.illumination
+    if images.captures != states.shape[1]:
+        raise ValueError(f"images must have one capture per state ({states.shape[1]}), got {images.captures}.")
+    reference = calibration_fields.reference
+    fields = _Run(method, before.fibrelets).amplitudes(images, "sample").in_phase_with(reference)
+    fields = fields.closed(reference, states, None)
+    noise = noise_scale(_closure(fields, reference, states))
+    return replace(
+        before,
+        fields=fields.values - reference,
+        variance=noise.variance(fields.values, fields.variance),
+        inflation=noise.inflation,
+        relative_error=noise.relative_error,
+        status=fields.status,
+        stray=noise.stray,
     )
 
 

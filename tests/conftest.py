@@ -23,5 +23,5 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 # Random input: some 2,000 examples of the parsers in every run, more than 100,000 with POLINFER_FUZZ=fuzz. A machine
 # with other work on it is slow now and then, which is no failure.
 settings.register_profile("quick", deadline=None, max_examples=150)
-settings.register_profile("fuzz", deadline=None, max_examples=8000)
+settings.register_profile("fuzz", deadline=None, max_examples=9000)
 settings.load_profile(os.environ.get("POLINFER_FUZZ", "quick"))
