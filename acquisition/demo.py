@@ -127,8 +127,9 @@ def run_demo(
 def _page(result: DemoResult, folder: Path, pitch: float, seed: int) -> Path:
     chi_square, freedom, pixels = result.chi_square
     note = (
-        f"A lesion behind a simulated fibre, scene {seed}. Against the truth, the fitted Jones matrices have a chi-square "
-        f"of {chi_square / freedom:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is as stated."
+        f"A lesion behind a simulated fibre, scene {seed}. Against the truth, the fitted Jones matrices have a "
+        f"chi-square of {chi_square / freedom:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is "
+        "as stated."
     )
     seconds, title = result.seconds, "polinfer demo"
     return write_report(folder, title=title, seconds=seconds, pixel_size=pitch, rng=seed, notes=(note,))
