@@ -126,10 +126,10 @@ def run_demo(
 
 def _page(result: DemoResult, folder: Path, pitch: float, seed: int) -> Path:
     chi_square, freedom, pixels = result.chi_square
+    ratio = chi_square / freedom
     note = (
         f"A lesion behind a simulated fibre, scene {seed}. Against the truth, the fitted Jones matrices have a "
-        f"chi-square of {chi_square / freedom:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is "
-        "as stated."
+        f"chi-square of {ratio:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is as stated."
     )
     seconds, title = result.seconds, "polinfer demo"
     return write_report(folder, title=title, seconds=seconds, pixel_size=pitch, rng=seed, notes=(note,))
