@@ -56,9 +56,9 @@ class _Section:
     def picture(self, figure: Figure, caption: str) -> None:
         buffer = io.BytesIO()
         figure.savefig(buffer, dpi=RESOLUTION)
-        width, height = figure.get_size_inches()
-        # on a phone a wide row of maps is scrolled, not shrunk
-        least = int(45 * width) if width > 2.5 * height else 0
+        width, _ = figure.get_size_inches()
+        # on a phone a picture of many maps is scrolled, not shrunk until nothing is seen
+        least = int(45 * width) if width > 7 else 0
         data = base64.b64encode(buffer.getvalue()).decode()
         self.pictures.append({"data": data, "caption": caption, "least": str(least)})
 
