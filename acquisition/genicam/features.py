@@ -13,40 +13,18 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
-from xml.etree.ElementTree import Element, ParseError
+from typing import Any
+from xml.etree.ElementTree import Element
 
-import defusedxml.ElementTree
-from defusedxml.common import DefusedXmlException
-
-from acquisition.errors import DeviceRefused, ProtocolError, SettingError
+from acquisition.errors import ProtocolError, SettingError
+from acquisition.genicam.description import VALUE_NODES, WHOLE, every, first, integer_of, local, number_of, read_nodes
 from acquisition.genicam.formula import Formula, Number
+from acquisition.genicam.registers import Port, Registers
 
-__all__ = ["Feature", "Features", "Port"]
+__all__ = ["Feature", "Features"]
 
-LARGEST = 16 << 20  # bytes of XML
-MOST = 50_000  # nodes
 DEEPEST = 40  # nodes that refer to each other in a chain
-LONGEST_REGISTER = 1 << 16
-
-_VALUE_NODES = {
-    "Integer", "IntReg", "MaskedIntReg", "Float", "FloatReg", "StringReg", "Register", "Boolean", "Enumeration",
-    "Command", "Converter", "IntConverter", "SwissKnife", "IntSwissKnife",
-}  # fmt: skip
-_NODES = _VALUE_NODES | {"Category", "Port"}
-_WHOLE = {"Integer", "IntReg", "MaskedIntReg", "IntConverter", "IntSwissKnife", "Boolean", "Enumeration", "Command"}
-
-
-class Port(Protocol):
-    """Registers of a device."""
-
-    def read(self, address: int, count: int) -> bytes:
-        """``count`` bytes."""
-
-    def write(self, address: int, data: bytes) -> None:
-        """All of ``data``."""
 
 
 @dataclass(frozen=True)
@@ -64,40 +42,6 @@ class Feature:
     access: str
 
 
-def _local(tag: Any) -> str:
-    return str(tag).rsplit("}", 1)[-1]
-
-
-def _texts(node: Element, tag: str) -> Iterator[str]:
-    for child in node:
-        if _local(child.tag) == tag:
-            yield (child.text or "").strip()
-
-
-def _text(node: Element, tag: str) -> str | None:
-    return next(_texts(node, tag), None)
-
-
-def _whole(text: str) -> int:
-    try:
-        value = int(text, 16) if text[:2].lower() == "0x" else int(text, 10)
-    except ValueError as error:
-        raise ProtocolError(f"the camera's XML has {text[:40]!r} where a whole number must be.") from error
-    if abs(value) >= 1 << 64:
-        raise ProtocolError(f"the camera's XML has the number {text[:40]}, beyond 64 bits.")
-    return value
-
-
-def _real(text: str) -> float:
-    try:
-        value = float(int(text, 16)) if text[:2].lower() == "0x" else float(text)
-    except ValueError as error:
-        raise ProtocolError(f"the camera's XML has {text[:40]!r} where a number must be.") from error
-    if math.isnan(value):
-        raise ProtocolError("the camera's XML has NaN where a number must be.")
-    return value
-
-
 class Features:
     """Features of a device by name.
 
@@ -106,38 +50,14 @@ class Features:
     """
 
     def __init__(self, xml: bytes, port: Port) -> None:
-        if len(xml) > LARGEST:
-            raise ProtocolError(f"the camera's XML has {len(xml)} bytes; more than {LARGEST} are refused.")
-        try:
-            root = defusedxml.ElementTree.fromstring(xml, forbid_dtd=True)
-        except (ParseError, DefusedXmlException, ValueError, LookupError, RecursionError) as error:
-            raise ProtocolError(f"the camera's XML cannot be read: {type(error).__name__} {error}.") from error
-        if _local(root.tag) != "RegisterDescription":
-            raise ProtocolError(f"the camera's XML begins with {_local(root.tag)[:40]!r}, not RegisterDescription.")
         self.port = port
-        self.nodes: dict[str, Element] = {}
+        self.nodes = read_nodes(xml)
         self._formulas: dict[tuple[str, str], Formula] = {}
         self._depth = 0
-        for node in self._all(root):
-            name = node.get("Name", "")
-            if not name or name in self.nodes:
-                raise ProtocolError(f"the camera's XML has two nodes {name[:80]!r}, or one without a name.")
-            self.nodes[name] = node
-            if len(self.nodes) > MOST:
-                raise ProtocolError(f"the camera's XML has more than {MOST} nodes.")
-
-    def _all(self, root: Element) -> Iterator[Element]:
-        """Nodes, also those in groups."""
-        stack = list(root)[::-1]
-        while stack:
-            node = stack.pop()
-            if _local(node.tag) in _NODES:
-                yield node
-            elif _local(node.tag) == "Group":
-                stack.extend(list(node)[::-1])
+        self._registers = Registers(lambda: self.port, self._number, self._variables)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.nodes and _local(self.nodes[name].tag) in _VALUE_NODES
+        return name in self.nodes and local(self.nodes[name].tag) in VALUE_NODES
 
     def names(self) -> list[str]:
         """Features that the categories show, from Root downwards, in order; all values where there is no Root."""
@@ -150,8 +70,8 @@ class Features:
             if name in seen or name not in self.nodes:
                 continue
             seen.add(name)
-            if _local(self.nodes[name].tag) == "Category":
-                stack.extend(list(_texts(self.nodes[name], "pFeature"))[::-1])
+            if local(self.nodes[name].tag) == "Category":
+                stack.extend(list(every(self.nodes[name], "pFeature"))[::-1])
             else:
                 found[name] = None
         return list(found)
@@ -159,9 +79,9 @@ class Features:
     def feature(self, name: str) -> Feature:
         """Kind, unit, limits, choices and access as they are now."""
         node = self._node(name)
-        tag = _local(node.tag)
+        tag = local(node.tag)
         kind = {"Boolean": "switch", "Enumeration": "choice", "Command": "action", "StringReg": "text",
-                "Register": "bytes"}.get(tag, "integer" if tag in _WHOLE else "number")  # fmt: skip
+                "Register": "bytes"}.get(tag, "integer" if tag in WHOLE else "number")  # fmt: skip
         low, high, step = self.limits(name) if kind in ("integer", "number") else (None, None, None)
         choices = tuple(self._entries(node)) if kind == "choice" else ()
         return Feature(name, kind, self._unit(node), low, high, step, choices, self.access(name))
@@ -171,14 +91,14 @@ class Features:
         with _Deeper(self):
             node = self._node(name)
             for tag in ("pIsImplemented", "pIsAvailable"):
-                one = _text(node, tag)
+                one = first(node, tag)
                 if one is not None and not self._number(one):
                     return ""
-            imposed = {"RO": "ro", "WO": "wo"}.get(_text(node, "ImposedAccessMode") or "", "rw")
+            imposed = {"RO": "ro", "WO": "wo"}.get(first(node, "ImposedAccessMode") or "", "rw")
             below = self._access_below(node)
             both = "".join(c for c in "rw" if self._allows(imposed, c) and self._allows(below, c))
             access = {"r": "ro", "w": "wo", "rw": "rw", "": ""}[both]
-            lock = _text(node, "pIsLocked")
+            lock = first(node, "pIsLocked")
             if lock is not None and access in ("rw", "wo") and self._number(lock):
                 return "ro" if access == "rw" else ""
             return access
@@ -188,12 +108,12 @@ class Features:
         return access == "rw" or access == {"r": "ro", "w": "wo"}[what]
 
     def _access_below(self, node: Element) -> str:
-        tag = _local(node.tag)
+        tag = local(node.tag)
         if tag in ("SwissKnife", "IntSwissKnife"):
             return "ro"
         if tag in ("IntReg", "MaskedIntReg", "FloatReg", "StringReg", "Register"):
-            return {"RO": "ro", "WO": "wo", "RW": "rw"}.get(_text(node, "AccessMode") or "RO", "ro")
-        below = _text(node, "pValue")
+            return {"RO": "ro", "WO": "wo", "RW": "rw"}.get(first(node, "AccessMode") or "RO", "ro")
+        below = first(node, "pValue")
         return self.access(below) if below is not None else "rw"
 
     def get(self, name: str) -> Any:
@@ -201,7 +121,7 @@ class Features:
         node = self._node(name)
         if not self._allows(self.access(name), "r"):
             raise SettingError(f"{name} cannot be read now.")
-        tag = _local(node.tag)
+        tag = local(node.tag)
         if tag == "Boolean":
             return self._number(name) == self._on_off(node)[0]
         if tag == "Enumeration":
@@ -211,10 +131,10 @@ class Features:
                     return entry
             raise ProtocolError(f"{name} has the value {value}, which is none of its choices.")
         if tag == "StringReg":
-            raw = self._bytes(node)
+            raw = self._registers.raw(node)
             return raw.split(b"\0")[0].decode("utf-8", "replace")
         if tag == "Register":
-            return self._bytes(node)
+            return self._registers.raw(node)
         return self._number(name)
 
     def set(self, name: str, value: Any) -> None:
@@ -222,7 +142,7 @@ class Features:
         node = self._node(name)
         if not self._allows(self.access(name), "w"):
             raise SettingError(f"{name} cannot be written now (read-only, locked or not available).")
-        tag = _local(node.tag)
+        tag = local(node.tag)
         if tag == "Boolean":
             self._put(name, self._on_off(node)[0 if value else 1])
         elif tag == "Enumeration":
@@ -238,11 +158,11 @@ class Features:
             self._put_number(name, tag, value)
 
     def _put_text(self, node: Element, name: str, value: Any) -> None:
-        length = self._length(node)
+        length = self._registers.length(node)
         raw = value.encode() if isinstance(value, str) else None
         if raw is None or len(raw) > length:
             raise SettingError(f"{name} must be text of at most {length} bytes, got {value!r}.")
-        self.port.write(self._address(node), raw.ljust(length, b"\0"))
+        self.port.write(self._registers.address(node), raw.ljust(length, b"\0"))
 
     def _put_number(self, name: str, tag: str, value: Any) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -250,16 +170,14 @@ class Features:
         low, high, step = self.limits(name)
         if not math.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
             raise SettingError(f"{name} must be from {low} to {high}, got {value!r}.")
-        if tag in _WHOLE and (
-            value != int(value) or (step and low is not None and (int(value) - int(low)) % int(step))
-        ):
+        if tag in WHOLE and (value != int(value) or (step and low is not None and (int(value) - int(low)) % int(step))):
             raise SettingError(f"{name} must be {low} plus a multiple of {step}, got {value!r}.")
-        self._put(name, int(value) if tag in _WHOLE else float(value))
+        self._put(name, int(value) if tag in WHOLE else float(value))
 
     def execute(self, name: str) -> None:
         """Do what a command stands for."""
         node = self._node(name)
-        if _local(node.tag) != "Command":
+        if local(node.tag) != "Command":
             raise SettingError(f"{name} is no command.")
         if not self._allows(self.access(name), "w"):
             raise SettingError(f"{name} cannot be executed now.")
@@ -268,7 +186,7 @@ class Features:
     def running(self, name: str) -> bool:
         """Whether a command has not finished yet; False where that cannot be read."""
         node = self._node(name)
-        below = _text(node, "pValue")
+        below = first(node, "pValue")
         if below is None or not self._allows(self.access(below), "r"):
             return False
         return self._number(below) == self._command_value(node)
@@ -277,14 +195,14 @@ class Features:
         """Smallest and largest value and increment, None where there is none."""
         with _Deeper(self):
             node = self._node(name)
-            tag = _local(node.tag)
-            whole = tag in _WHOLE
+            tag = local(node.tag)
+            whole = tag in WHOLE
             bounds = [self._bound(node, part, whole) for part in ("Min", "Max", "Inc")]
             if tag in ("IntReg", "MaskedIntReg"):
-                bits, signed = self._bits(node)[1], _text(node, "Sign") == "Signed"
+                bits, signed = self._registers.bits(node)[1], first(node, "Sign") == "Signed"
                 natural = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signed else (0, (1 << bits) - 1)
                 bounds[:2] = [own if own is not None else n for own, n in zip(bounds[:2], natural, strict=True)]
-            below = _text(node, "pValue")
+            below = first(node, "pValue")
             if below is not None and tag in ("Integer", "Float"):
                 inner = self.limits(below)
                 bounds = [own if own is not None else i for own, i in zip(bounds, inner, strict=True)]
@@ -302,16 +220,16 @@ class Features:
         return [min(ends), max(ends)]
 
     def _bound(self, node: Element, part: str, whole: bool) -> Number | None:
-        own = _text(node, part)
+        own = first(node, part)
         if own is not None:
-            return _whole(own) if whole else _real(own)
-        other = _text(node, "p" + part)
+            return integer_of(own) if whole else number_of(own)
+        other = first(node, "p" + part)
         return None if other is None else self._number(other)
 
     def _unit(self, node: Element) -> str:
         with _Deeper(self):
-            own = _text(node, "Unit")
-            below = _text(node, "pValue")
+            own = first(node, "Unit")
+            below = first(node, "pValue")
             if own is not None or below is None or below not in self.nodes:
                 return (own or "")[:32]
             return self._unit(self._node(below))
@@ -329,21 +247,21 @@ class Features:
         return self.nodes[name]
 
     def _on_off(self, node: Element) -> tuple[int, int]:
-        return _whole(_text(node, "OnValue") or "1"), _whole(_text(node, "OffValue") or "0")
+        return integer_of(first(node, "OnValue") or "1"), integer_of(first(node, "OffValue") or "0")
 
     def _command_value(self, node: Element) -> int:
-        own, other = _text(node, "CommandValue"), _text(node, "pCommandValue")
-        return int(self._number(other)) if other is not None else _whole(own or "1")
+        own, other = first(node, "CommandValue"), first(node, "pCommandValue")
+        return int(self._number(other)) if other is not None else integer_of(own or "1")
 
     def _entries(self, node: Element, everything: bool = False) -> dict[str, int]:
         found = {}
         for child in node:
-            if _local(child.tag) != "EnumEntry":
+            if local(child.tag) != "EnumEntry":
                 continue
-            conditions = [_text(child, tag) for tag in ("pIsImplemented", "pIsAvailable")]
+            conditions = [first(child, tag) for tag in ("pIsImplemented", "pIsAvailable")]
             if not everything and any(c is not None and not self._number(c) for c in conditions):
                 continue
-            found[child.get("Name", "")] = _whole(_text(child, "Value") or "0")
+            found[child.get("Name", "")] = integer_of(first(child, "Value") or "0")
         return found
 
     # numbers
@@ -352,12 +270,14 @@ class Features:
         """The number behind any node."""
         with _Deeper(self):
             node = self._referred(name)
-            tag = _local(node.tag)
+            tag = local(node.tag)
             if tag in ("IntReg", "MaskedIntReg"):
-                return self._from_register(node)
+                return self._registers.value(node)
             if tag == "FloatReg":
-                raw = self._bytes(node)
-                value = float(struct.unpack(self._order(node) + self._float_code(name, len(raw)), raw)[0])
+                raw = self._registers.raw(node)
+                value = float(
+                    struct.unpack(self._registers.order(node) + self._registers.float_code(name, len(raw)), raw)[0]
+                )
                 if not math.isfinite(value):
                     raise ProtocolError(f"{name} is {value} in the device.")
                 return value
@@ -371,55 +291,55 @@ class Features:
             return self._plain(node, tag)
 
     def _plain(self, node: Element, tag: str) -> Number:
-        index = _text(node, "pIndex")
+        index = first(node, "pIndex")
         if index is not None:
             chosen = int(self._number(index))
             for child in node:
-                if _local(child.tag) in ("ValueIndexed", "pValueIndexed") and child.get("Index", "") == str(chosen):
+                if local(child.tag) in ("ValueIndexed", "pValueIndexed") and child.get("Index", "") == str(chosen):
                     text = (child.text or "").strip()
-                    if _local(child.tag) == "pValueIndexed":
+                    if local(child.tag) == "pValueIndexed":
                         return self._number(text)
-                    return _real(text) if tag == "Float" else _whole(text)
-            other, own = _text(node, "pValueDefault"), _text(node, "ValueDefault")
+                    return number_of(text) if tag == "Float" else integer_of(text)
+            other, own = first(node, "pValueDefault"), first(node, "ValueDefault")
         else:
-            other, own = _text(node, "pValue"), _text(node, "Value")
+            other, own = first(node, "pValue"), first(node, "Value")
         if other is not None:
             return self._number(other)
         if own is None:
             raise ProtocolError(f"the camera's XML gives {node.get('Name', '')[:80]!r} no value.")
         if own.lower() in ("true", "false"):
             return int(own.lower() == "true")
-        return _real(own) if tag == "Float" else _whole(own)
+        return number_of(own) if tag == "Float" else integer_of(own)
 
     def _put(self, name: str, value: Number) -> None:
         """Write the number behind any node."""
         with _Deeper(self):
             node = self._referred(name)
-            tag = _local(node.tag)
+            tag = local(node.tag)
             if tag in ("IntReg", "MaskedIntReg"):
-                self._to_register(node, int(value))
+                self._registers.put(node, int(value))
             elif tag == "FloatReg":
-                code = self._float_code(name, self._length(node))
-                self.port.write(self._address(node), struct.pack(self._order(node) + code, value))
+                code = self._registers.float_code(name, self._registers.length(node))
+                self.port.write(self._registers.address(node), struct.pack(self._registers.order(node) + code, value))
             elif tag in ("Converter", "IntConverter"):
                 found = self._formula(name, node, "FormulaTo")(self._variables(node) | {"FROM": value})
                 below = self._below(node)
-                whole = _local(self._referred(below).tag) in _WHOLE
+                whole = local(self._referred(below).tag) in WHOLE
                 self._put(below, round(found) if whole else found)
             elif tag in ("SwissKnife", "IntSwissKnife", "StringReg", "Register", "Category", "Port"):
                 raise ProtocolError(f"the camera's XML writes a number to {name[:80]!r}, a {tag}.")
-            elif _text(node, "pValue") is not None:
+            elif first(node, "pValue") is not None:
                 self._put(self._below(node), value)
-                for copy in _texts(node, "pValueCopy"):
+                for copy in every(node, "pValueCopy"):
                     self._put(copy, value)
-            elif _text(node, "Value") is not None:
-                element = next(child for child in node if _local(child.tag) == "Value")
+            elif first(node, "Value") is not None:
+                element = next(child for child in node if local(child.tag) == "Value")
                 element.text = repr(value)
             else:
                 raise SettingError(f"{name} cannot be written.")
 
     def _below(self, node: Element) -> str:
-        below = _text(node, "pValue")
+        below = first(node, "pValue")
         if below is None:
             raise ProtocolError(f"the camera's XML gives {node.get('Name', '')[:80]!r} no pValue.")
         return below
@@ -427,13 +347,13 @@ class Features:
     def _formula(self, name: str, node: Element, tag: str) -> Formula:
         key = (name, tag)
         if key not in self._formulas:
-            text = _text(node, tag)
+            text = first(node, tag)
             if text is None:
                 raise ProtocolError(f"the camera's XML gives {name[:80]!r} no {tag}.")
-            whole = _local(node.tag) in ("IntSwissKnife", "IntConverter")
+            whole = local(node.tag) in ("IntSwissKnife", "IntConverter")
             named = {}
             for child in node:
-                if _local(child.tag) == "Expression":
+                if local(child.tag) == "Expression":
                     named[child.get("Name", "")] = Formula((child.text or "").strip(), whole)
             formula = Formula(text, whole)
             if named:
@@ -445,98 +365,11 @@ class Features:
         found: dict[str, Number] = {}
         for child in node:
             text = (child.text or "").strip()
-            if _local(child.tag) == "pVariable":
+            if local(child.tag) == "pVariable":
                 found[child.get("Name", "")] = self._number(text)
-            elif _local(child.tag) == "Constant":
-                found[child.get("Name", "")] = _real(text)
+            elif local(child.tag) == "Constant":
+                found[child.get("Name", "")] = number_of(text)
         return found
-
-    # registers
-
-    @staticmethod
-    def _float_code(name: str, length: int) -> str:
-        if length not in (4, 8):
-            raise ProtocolError(f"{name[:80]} is a floating register of {length} bytes.")
-        return "f" if length == 4 else "d"
-
-    def _order(self, node: Element) -> str:
-        return ">" if _text(node, "Endianess") == "BigEndian" else "<"
-
-    def _length(self, node: Element) -> int:
-        own, other = _text(node, "Length"), _text(node, "pLength")
-        length = int(self._number(other)) if other is not None else _whole(own or "0")
-        if not 0 < length <= LONGEST_REGISTER:
-            raise ProtocolError(f"the camera's XML gives {node.get('Name', '')[:80]!r} a length of {length} bytes.")
-        return length
-
-    def _address(self, node: Element) -> int:
-        address = sum(_whole(text) for text in _texts(node, "Address"))
-        address += sum(int(self._number(name)) for name in _texts(node, "pAddress"))
-        for child in node:
-            if _local(child.tag) == "pIndex":
-                offset = child.get("Offset")
-                step = _whole(offset) if offset is not None else self._length(node)
-                other = child.get("pOffset")
-                if other is not None:
-                    step = int(self._number(other))
-                address += step * int(self._number((child.text or "").strip()))
-            elif _local(child.tag) == "IntSwissKnife":
-                formula = Formula(_text(child, "Formula") or "", whole=True)
-                address += int(formula(self._variables(child)))
-        if not 0 <= address < 1 << 64:
-            raise ProtocolError(f"the camera's XML gives {node.get('Name', '')[:80]!r} the address {address}.")
-        return address
-
-    def _bytes(self, node: Element) -> bytes:
-        count = self._length(node)
-        try:
-            raw = self.port.read(self._address(node), count)
-        except DeviceRefused as error:
-            error.add_note(f"reading {node.get('Name', '')[:80]}")
-            raise
-        if len(raw) != count:
-            raise ProtocolError(f"the device gave {len(raw)} bytes for {count} of {node.get('Name', '')[:80]!r}.")
-        return raw
-
-    def _bits(self, node: Element) -> tuple[int, int]:
-        """Place of the lowest bit, and how many there are."""
-        total = 8 * self._length(node)
-        if total > 64:
-            raise ProtocolError(f"{node.get('Name', '')[:80]!r} is a whole number of {total} bits.")
-        if _local(node.tag) == "IntReg":
-            return 0, total
-        bit = _text(node, "Bit")
-        ends = [_whole(bit or _text(node, tag) or "0") for tag in ("LSB", "MSB")]
-        if self._order(node) == ">":
-            ends = [total - 1 - e for e in ends]
-        low, high = min(ends), max(ends)
-        if not 0 <= low <= high < total:
-            raise ProtocolError(
-                f"the camera's XML gives {node.get('Name', '')[:80]!r} bits {low} to {high} of {total}."
-            )
-        return low, high - low + 1
-
-    def _from_register(self, node: Element) -> int:
-        raw = int.from_bytes(self._bytes(node), "big" if self._order(node) == ">" else "little")
-        low, count = self._bits(node)
-        value = (raw >> low) & ((1 << count) - 1)
-        if _text(node, "Sign") == "Signed" and value >> (count - 1):
-            value -= 1 << count
-        return value
-
-    def _to_register(self, node: Element, value: int) -> None:
-        low, count = self._bits(node)
-        signed = _text(node, "Sign") == "Signed"
-        smallest, largest = (-(1 << (count - 1)), (1 << (count - 1)) - 1) if signed else (0, (1 << count) - 1)
-        if not smallest <= value <= largest:
-            raise SettingError(f"{node.get('Name', '')} must be from {smallest} to {largest}, got {value}.")
-        length = self._length(node)
-        order: Any = "big" if self._order(node) == ">" else "little"
-        mask = ((1 << count) - 1) << low
-        others = 0
-        if count < 8 * length:
-            others = int.from_bytes(self._bytes(node), order) & ~mask
-        self.port.write(self._address(node), (others | ((value << low) & mask)).to_bytes(length, order))
 
 
 @dataclass(frozen=True)

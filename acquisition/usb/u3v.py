@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from acquisition.errors import FrameLost, ProtocolError
-from acquisition.genicam.features import LARGEST
+from acquisition.genicam.description import LARGEST
 
 __all__ = [
     "FORMATS",
