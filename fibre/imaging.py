@@ -71,7 +71,7 @@ def transmission_image(measurement: Measurement) -> TransmissionImage:
     >>> u = np.eye(2) + 0j
     >>> image = transmission_image(Measurement(u, 0.5j * u, sigma=0.01))
     >>> round(float(image.amplitude), 3), round(float(image.phase), 3), round(float(image.phase_std), 4)
-    (0.5, 1.571, 0.0141)
+    (0.5, 1.571, 0.01)
 
     Source: S. Pancharatnam, Proc. Indian Acad. Sci. A 44, 247 (1956).
     """

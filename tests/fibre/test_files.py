@@ -57,6 +57,7 @@ def records(standard):
         fibre.Retrieved(complex_stack(2, 3, 4).astype(np.complex64), np.ones((2, 3, 4)), np.array([0, 3], np.uint8),
                         np.array([5, 6], np.int32)),
         fibre.Staleness(np.array([0.1, -2.0]), 0.02, 0.3),
+        fibre.TransmissionImage(*np.arange(24.0).reshape(4, 2, 3)),
         calibrated,
         recover(calibrated, ForwardInverse()),
         standard.recording(sample, standard.light(), 0.01, 0),
