@@ -222,7 +222,7 @@ def retrieved(results: Results, size: int | None) -> None:
     )  # fmt: skip
     calibration = live.calibration(bench, replace(plan, views=VIEWS))
     start = time.perf_counter()
-    fields = retrieve_fields(calibration, Modal(scene.fields.fibrelets, steps=1), scene.fields.fibrelets, progress=True)
+    fields = retrieve_fields(calibration, Modal(scene.fields.fibrelets), scene.fields.fibrelets, progress=True)
     middle = time.perf_counter()
     inverse = recover(fields, ForwardInverse()).matrix
     end = time.perf_counter()
