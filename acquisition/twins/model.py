@@ -83,7 +83,7 @@ class UsbModel(ABC):
         if request_type == 0x02 and request == 3 and value == 0:  # SET_FEATURE(ENDPOINT_HALT)
             self.halted.add(index & 0xFF)
             return b""
-        if request_type in (0x00, 0x01) and request in (5, 9, 11, 0x30, 0x31):
+        if request_type in (0x00, 0x01) and request in (1, 3, 5, 9, 11, 0x30, 0x31):
             return b""
         if request_type == 0x80 and request == 8:
             return b"\x01"
