@@ -107,10 +107,13 @@ def guest() -> None:
     twin = CameraTwin()
     plugged = Plugged(twin)
     speeds = Path("/sys/bus/usb/devices")
-    assert wait_for(lambda: any(p.joinpath("idProduct").exists() and p.joinpath("idProduct").read_text().strip() == "0001"
-                                for p in speeds.iterdir()), 30)  # fmt: skip
-    device = next(p for p in speeds.iterdir() if p.joinpath("idProduct").exists()
-                  and p.joinpath("idProduct").read_text().strip() == "0001")  # fmt: skip
+
+    def cameras() -> list[Path]:
+        products = [p / "idProduct" for p in speeds.iterdir() if (p / "idProduct").exists()]
+        return [p.parent for p in products if p.read_text().strip() == f"{twin.product:04x}"]
+
+    assert wait_for(cameras, 30)
+    device = cameras()[0]
     say(step="camera enumerated", speed=device.joinpath("speed").read_text().strip(),
         serial=device.joinpath("serial").read_text().strip())  # fmt: skip
     losses, frames, replugged = 0, 0, 0.0
