@@ -13,6 +13,7 @@ import gzip
 import json
 import lzma
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -20,10 +21,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = """
-    usb-common usbcore usbip-core vhci-hcd usbtmc virtio virtio_ring virtio_pci_legacy_dev virtio_pci_modern_dev
-    virtio_pci fscache netfs 9pnet 9pnet_virtio 9p
-""".split()  # noqa: SIM905
+MODULES = ("vhci-hcd", "usbtmc", "virtio_pci", "9pnet_virtio", "9p")
 MARK = "GUEST:"
 LIMIT = 900  # seconds
 
@@ -49,18 +47,33 @@ def host(folder: Path) -> int:
     return 0
 
 
+def _modules(folder: Path) -> dict[str, bytes]:
+    """The modules that are wanted and all that they depend on, in the order in which they can be loaded."""
+    paths = {path.name.split(".")[0].replace("_", "-"): path for path in folder.glob("**/*.ko*")}
+    found: dict[str, bytes] = {}
+
+    def add(name: str) -> None:
+        name = name.replace("_", "-")
+        if name in found or name not in paths:  # the latter are built in
+            return
+        raw = paths[name].read_bytes()
+        raw = lzma.decompress(raw) if paths[name].suffix == ".xz" else raw
+        depends = re.search(rb"\0depends=([^\0]*)\0", raw)
+        for other in filter(None, depends[1].decode().split(",") if depends else []):
+            add(other)
+        found[name] = raw
+
+    for name in MODULES:
+        add(name)
+    return found
+
+
 def _archive(folder: Path) -> bytes:
     """A cpio archive with busybox, the modules and the first program."""
     files = {"bin/busybox": (next(folder.glob("**/bin/busybox")).read_bytes(), 0o755)}
-    found = {path.name.split(".")[0].replace("_", "-"): path for path in folder.glob("**/*.ko*")}
-    order = []
-    for name in MODULES:
-        path = found.get(name.replace("_", "-"))
-        if path is None:
-            continue  # built in
-        raw = path.read_bytes()
-        files[f"modules/{name}.ko"] = (lzma.decompress(raw) if path.suffix == ".xz" else raw, 0o644)
-        order.append(name)
+    for name, raw in _modules(folder).items():
+        files[f"modules/{name}.ko"] = (raw, 0o644)
+    order = [name.split("/")[1].removesuffix(".ko") for name in files if name.startswith("modules/")]
     mounts = "; ".join(f"mount -o bind /{name} /host/{name}" for name in ("proc", "sys", "dev"))
     files["init"] = (
         f"""#!/bin/busybox sh

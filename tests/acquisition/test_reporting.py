@@ -75,6 +75,7 @@ def test_a_browser_shows_it_without_errors_at_any_width(page, width, tmp_path):
     assert "CONSOLE" not in done.stderr
 
 
+@pytest.mark.slow
 def test_other_models_and_the_command(tmp_path):
     records(tmp_path, Model(ordering=PolariserFirst(), gain=ComplexGain(1.0)), shape=(2, 3))
     found = CliRunner().invoke(report_command, [str(tmp_path), "--simulations", "0", "--title", "Small"])
