@@ -30,6 +30,7 @@ ALL = (
     "contrast",
     "cohort_contrast",
     "acquisition",
+    "streaming",
     "accelerator",
 )
 
