@@ -66,8 +66,9 @@ class FibreImager:
     def measurement(self, raw: Images) -> Measurement:
         """Fields, then Jones matrices at the distal points."""
         calibration = self.inverse.calibration
+        if self._first is None:
+            raise ValueError("raw must be of this imager; call expose first.")
         if self._fields is None:
-            assert self._first is not None
             self._fields = retrieve_fields(self._first, self.method, calibration.fibrelets)
             if raw is self._first.images:
                 return reconstruct(self.inverse, self._fields)
