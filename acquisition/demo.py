@@ -132,7 +132,8 @@ def _page(result: DemoResult, folder: Path, pitch: float, seed: int) -> Path:
         f"chi-square of {ratio:.2f} per degree of freedom, from {pixels} pixels; 1 means that the noise is as stated."
     )
     seconds, title = result.seconds, "polinfer demo"
-    return write_report(folder, title=title, seconds=seconds, pixel_size=pitch, rng=seed, notes=(note,))
+    labels = result.phantom.labels
+    return write_report(folder, title=title, seconds=seconds, pixel_size=pitch, rng=seed, notes=(note,), labels=labels)
 
 
 def report(result: DemoResult, echo: Callable[[str], None]) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 import polinfer
 from fibre import load, transmission_image
-from polinfer import Fit, Measurement, Model, Parameters, PolariserFirst, RetarderFirst, Status, texture
+from polinfer import Fit, Measurement, Model, Parameters, PolariserFirst, RetarderFirst, Status, contrast, texture
 from polinfer.checks import integer, one_of_types
 
 if TYPE_CHECKING:
@@ -73,6 +73,7 @@ def write_report(
     pixel_size: float | None = None,
     rng: int = 0,
     notes: tuple[str, ...] = (),
+    labels: Any = None,
 ) -> Path:
     """Write ``report.html`` into a folder that holds ``measurement.nc`` and ``fit.nc``; the path.
 
@@ -85,7 +86,8 @@ def write_report(
     folder: with the records. out: the page; None: ``report.html`` in the folder. title: of the page. seconds: by
     stage, for the table of timings. draws: of each chain for the posteriors of pixels. simulations: of scenes for the
     power; 0: no power is stated. pixel_size: metres between pixels, for scale bars. rng: seed of draws and
-    simulations. notes: sentences at the top, for instance how far a demo ended from its truth.
+    simulations. notes: sentences at the top, for instance how far a demo ended from its truth. labels: integers, the
+    pixels' shape: 0 and 1 are two regions, such as tissue and lesion, whose contrast is stated; None: no contrast.
 
     Raises FileNotFoundError where a record is missing, ValueError for records of other kinds.
     """
@@ -100,6 +102,7 @@ def write_report(
         *_tilt(fitted),
         _orderings(fitted, measurement, simulations, rng),
         *_texture(fitted, pixel_size),
+        *_contrast(fitted, labels, rng),
         *_timings(seconds),
         _provenance(folder, fitted),
     ]
@@ -273,6 +276,36 @@ def _texture(fitted: Fit, pixel_size: float | None) -> list[_Section]:
         texture.of_fit(fitted, size=size).plot(pixel_size), "Expectation above differential entropy (nats)."
     )
     return [section]
+
+
+def _contrast(fitted: Fit, labels: Any, rng: int) -> list[_Section]:
+    """Of regions 0 and 1, parameter by parameter; groups of pixels are drawn again, as neighbours are alike."""
+    if labels is None:
+        return []
+    labels = np.broadcast_to(np.asarray(labels), np.shape(fitted.status))
+    if not {0, 1} <= set(np.unique(labels).tolist()):
+        raise ValueError("labels must hold the regions 0 and 1.")
+    groups = contrast.tiles(labels.shape, max(2, min(labels.shape[-2:]) // 4))
+    rows: list[list[Any]] = []
+    for name in Parameters._fields:
+        told = _known(fitted) & ((np.asarray(fitted.status) & int(Status.unidentified(name))) == 0)
+        values = np.where(told, np.asarray(getattr(fitted.parameters, name)), np.nan)
+        period = None if name == "diattenuation" else (np.pi if name.endswith("angle") else 2 * np.pi)
+        if min(np.count_nonzero(told & (labels == k)) for k in (0, 1)) < 10:
+            rows.append([name.replace("_", " "), "too few pixels tell it", "", "", ""])
+            continue
+        found = [f(values, labels, samples=groups, period=period, rng=rng) for f in (contrast.cnr, contrast.gcnr)]
+        rows.append([name.replace("_", " "), *(cell for c in found for cell in (float(c.value), _interval(c)))])
+    text = (
+        "Regions 0 and 1. CNR: difference of means over the root of both variances; gCNR: 1 less the overlap of both "
+        "distributions. Intervals of 95 %, square groups of pixels drawn again."
+    )
+    head = ["parameter", "CNR", "interval", "gCNR", "interval"]
+    return [_Section("Contrast", [text], tables=[{"head": head, "rows": rows}])]
+
+
+def _interval(found: Any) -> str:
+    return f"{found.low:.2f} to {found.high:.2f}" if np.isfinite(found.low + found.high) else "too few groups"
 
 
 def _timings(seconds: dict[str, float] | None) -> list[_Section]:

@@ -16,6 +16,8 @@ from polinfer import ComplexGain, Model, PolariserFirst, phantoms, save
 
 STATES = np.stack([np.ones(3), np.exp(2j * np.pi * np.arange(3) / 3)]) / np.sqrt(2)
 
+LABELS = (np.arange(54).reshape(6, 9) % 9 > 4).astype(int)
+
 
 def records(folder, model, shape=(6, 9)):
     scene = phantoms.lesion(shape, rng=0)
@@ -29,13 +31,13 @@ def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     records(folder, Model(gain=ComplexGain(1.0)))
     return write_report(folder, title="A <b>test</b>", seconds={"fit": 1.5, "rest": 2.0}, draws=40, simulations=3,
-                        pixel_size=4e-6, notes=("A note & more.",))  # fmt: skip
+                        pixel_size=4e-6, notes=("A note & more.",), labels=LABELS)  # fmt: skip
 
 
 def test_it_holds_everything_and_asks_for_nothing(page):
     text = page.read_text()
     for title in ("Summary", "Maps", "Amplitude and phase", "What the data do not tell", "Posterior of three pixels",
-                  "Retarder first or polariser first?", "Texture", "Timings", "Provenance"):  # fmt: skip
+                  "Retarder first or polariser first?", "Texture", "Contrast", "Timings", "Provenance"):  # fmt: skip
         assert f"<h2>{title}</h2>" in text
     assert "A &lt;b&gt;test&lt;/b&gt;" in text  # what is given is text, never markup
     assert "A note &amp; more." in text
@@ -95,3 +97,15 @@ def test_what_is_missing_or_foreign_is_named(tmp_path):
     save(data, tmp_path / "fit.nc")
     found = CliRunner().invoke(report_command, [str(tmp_path)])
     assert "fit.nc" in found.output
+
+
+def test_contrast_is_that_of_the_library(page):
+    """The page's number of the retardance angle, from the record in its folder."""
+    fitted = polinfer.load(page.parent / "fit.nc")
+    angle = polinfer.contrast.cnr(fitted.parameters.retardance_angle, LABELS, period=np.pi, rng=0)
+    row = re.search(
+        r"<h2>Contrast</h2>.*?<td>retardance angle</td><td class=.number.>(.*?)</td>", page.read_text(), re.S
+    )
+    assert float(row[1]) == pytest.approx(angle.value, rel=1e-3)
+    with pytest.raises(ValueError, match="labels must hold"):
+        write_report(page.parent, page.parent / "other.html", labels=np.zeros((6, 9), int), simulations=0, draws=8)
