@@ -84,10 +84,10 @@ def retrieve_command(
     status = np.concatenate(parts)
     if status.any():
         click.echo(f"{np.count_nonzero(status)} of {len(status)} captures did not converge or misfit their images")
-    click.echo(
-        f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field, "
-        f"and {100 * fields.stray:.2f} % of its mean"
-    )
+    said = f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field"
+    if isinstance(fields, CalibrationFields):
+        said += f", and {100 * fields.stray:.2f} % of its mean"
+    click.echo(said)
 
 
 @click.command("recover")

@@ -16,7 +16,7 @@ from polinfer.checks import complex_array, real_array
 
 __all__ = ["NoiseScale", "closure_errors", "closure_phases", "closure_tilts", "noise_of_groups", "noise_scale"]
 
-FAILED = 2.0  # squared closure errors over the expected, above which a group is not like the others
+FAILED = 4.0  # squared closure errors over the expected, above which a group is not like the others
 
 
 @dataclass(frozen=True)
@@ -183,10 +183,11 @@ def noise_scale(errors: np.ndarray) -> NoiseScale:
 def noise_of_groups(groups: list[np.ndarray]) -> tuple[NoiseScale, np.ndarray]:
     """The noise of most groups of captures, and by how much each group's variance is larger, (groups,), >= 1.
 
-    A retrieval can fail in one capture of many: its group closes far worse than the others, must not set the noise of
-    all, and is not to be believed as they are. Groups whose errors are more than twice what the noise makes expected on
-    average are left out of it, again until none is, and get the factor that they show; all others get 1. ``groups``:
-    errors as in :func:`noise_scale`, one array (4, count) a group, none for groups of fewer than three states.
+    A retrieval can fail in one capture of many: its group closes far worse than the others, must not set the noise
+    of all, and is not to be believed as they are. The worst group is left out if its errors are more than four
+    times, on average, what the noise of the others makes expected, then the next, as long as half of all are left;
+    those that are out get the factor that they show, all others 1. ``groups``: errors as in :func:`noise_scale`,
+    one array (4, count) a group, none for groups of fewer than three states.
 
     >>> rng = np.random.default_rng(0)
     >>> powers = np.ones((3, 500))
@@ -201,12 +202,24 @@ def noise_of_groups(groups: list[np.ndarray]) -> tuple[NoiseScale, np.ndarray]:
     if not usable.any():
         return NoiseScale(), factors
     kept = usable.copy()
-    while True:
-        scale = noise_scale(np.concatenate([e for e, k in zip(groups, kept, strict=True) if k], axis=1))
-        for i in np.flatnonzero(usable):
-            factors[i] = np.mean(groups[i][0] / np.maximum(scale.expected(groups[i]), 1e-300))
-        # the worst first, as long as it is a minority that goes
-        worst = np.argmax(np.where(kept, factors, 0))
-        if factors[worst] <= FAILED or kept.sum() - 1 < 0.5 * usable.sum():
-            return scale, np.where(factors > FAILED, factors, 1.0)
-        kept[worst] = False
+
+    def scale_of(chosen: np.ndarray) -> NoiseScale:
+        return noise_scale(np.concatenate([e for e, k in zip(groups, chosen, strict=True) if k], axis=1))
+
+    def factor(scale: NoiseScale, i: int) -> float:
+        return float(np.mean(groups[i][0] / np.maximum(scale.expected(groups[i]), 1e-300)))
+
+    scale = scale_of(kept)
+    while kept.sum() > max(1, 0.5 * usable.sum()):
+        ratios = {int(i): factor(scale, int(i)) for i in np.flatnonzero(kept)}
+        worst = max(ratios, key=lambda i: ratios[i])
+        others = kept.copy()
+        others[worst] = False
+        without = scale_of(others)
+        # judged by the others: with few groups a bad one makes itself expected
+        if factor(without, worst) <= FAILED:
+            break
+        kept, scale = others, without
+    for i in np.flatnonzero(usable & ~kept):
+        factors[i] = max(factor(scale, int(i)), 1.0)
+    return scale, factors

@@ -139,12 +139,12 @@ def retrieve_fields(
     phase of its capture.
 
     The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power
-    plus a ``stray`` squared times the mean power of the capture, all found from the data: n states of illumination span
-    two dimensions, so n - 2 combinations of the fields must vanish (:func:`fibre.closure.closure_errors`), and how far
-    they do not measures all that the image noise does not explain. Captures of a calibration whose states close far
-    worse than the others' have failed: they get the variance that they show
-    (:func:`fibre.closure.noise_of_groups`). With two states there is no such check, and the image noise is all that is
-    stated.
+    plus, in a calibration, a ``stray`` squared times the mean power of the capture, all found from the data: n states
+    of illumination span two dimensions, so n - 2 combinations of the fields must vanish
+    (:func:`fibre.closure.closure_errors`), and how far they do not measures all that the image noise does not
+    explain. Captures of a calibration whose states close far worse than the others' have failed: they get the
+    variance that they show (:func:`fibre.closure.noise_of_groups`). With two states there is no such check, and the
+    image noise is all that is stated.
 
     Parameters
     ----------
@@ -222,7 +222,8 @@ def retrieve_fields(
     tilting = fibrelets if tracked else None
     fields, blank = (part.closed(mean_reference, record.illumination, tilting) for part in (fields, blank))
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
-    noise = noise_scale(np.concatenate(errors, axis=1))
+    # a sample's light is everywhere: what strays cannot be told from what is in proportion
+    noise = noise_scale(np.concatenate(errors, axis=1)[:3])
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
     return RecordingFields(
         fields.values - mean_reference,
@@ -235,7 +236,6 @@ def retrieve_fields(
         record.illumination,
         fields.status,
         blank.status,
-        noise.stray,
     )
 
 
@@ -261,7 +261,7 @@ def retrieve_sample(
     reference = calibration_fields.reference
     fields = _Run(method, before.fibrelets).amplitudes(images, "sample").in_phase_with(reference)
     fields = fields.closed(reference, states, None)
-    noise = noise_scale(_closure(fields, reference, states))
+    noise = noise_scale(_closure(fields, reference, states)[:3])
     return replace(
         before,
         fields=fields.values - reference,
@@ -269,7 +269,6 @@ def retrieve_sample(
         inflation=noise.inflation,
         relative_error=noise.relative_error,
         status=fields.status,
-        stray=noise.stray,
     )
 
 

@@ -350,8 +350,8 @@ class RecordingFields:
     """Mode amplitudes of a recording: n states with the sample and n without, in the calibration's fibrelets.
 
     fields, blank: complex (n, 2, m), phase relative to the reference spot; variance, blank_variance: real,
-    E|error|^2, ``inflation``, ``relative_error`` and ``stray`` contained. illumination: complex (2, n), nominal.
-    status, blank_status: :class:`RetrievalStatus` (n,), or None.
+    E|error|^2, ``inflation`` and ``relative_error`` contained. illumination: complex (2, n), nominal. status,
+    blank_status: :class:`RetrievalStatus` (n,), or None.
     """
 
     fields: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
@@ -364,7 +364,6 @@ class RecordingFields:
     illumination: np.ndarray = array(("polarisation", "state"), "1")
     status: np.ndarray | None = array(("state",), "1", default=None)
     blank_status: np.ndarray | None = array(("state",), "1", default=None)
-    stray: float = setting(default=0.0)
 
 
 @dataclass(frozen=True)

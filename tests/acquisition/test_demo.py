@@ -10,7 +10,6 @@ from acquisition.demo import report, run_demo
 from acquisition.run import Folder
 from polinfer import Parameters
 from polinfer.cli import main
-from polinfer.validation import jones_chi_square
 
 GRID = (10, 10)
 
@@ -28,11 +27,7 @@ def result(folder):
 def test_the_fitted_jones_matrices_are_true_within_the_noise(result):
     chi_square, freedom, pixels = result.chi_square
     assert pixels >= 90
-    values, degrees = jones_chi_square(result.fit, result.jones)
-    inner = (slice(1, -1), slice(1, -1))
-    assert 0.7 < np.nansum(values[inner]) / degrees[inner].sum() < 1.4
-    # at the grid's edge, a third of so small a frame, sigma is too small, as limits.md says
-    assert 0.7 < chi_square / freedom < 1.7
+    assert 0.7 < chi_square / freedom < 1.4
 
 
 def test_every_file_is_there_and_loads(result, folder):
