@@ -7,7 +7,7 @@ suite of tests runs on every implementation.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -18,7 +18,17 @@ from acquisition.exposure import MergeRule
 from acquisition.plan import Step, Views
 from acquisition.settings import Setting, Written
 
-__all__ = ["AnyBench", "Camera", "Device", "Frame", "Instrument", "PhaseModulator", "Shown"]
+__all__ = ["AnyBench", "Camera", "Device", "Frame", "Instrument", "PhaseModulator", "Shown", "leave_safely"]
+
+
+def leave_safely(make_safe: Callable[[], None], error: BaseException | None) -> None:
+    """Make safe on the way out: its failure is raised, but never in place of ``error``, which takes it as a note."""
+    try:
+        make_safe()
+    except AcquisitionError as failed:
+        if error is None:
+            raise
+        error.add_note(f"and it could not be made safe: {failed}")
 
 
 class Device(ABC):
@@ -90,11 +100,7 @@ class Device(ABC):
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         try:
-            self.make_safe()
-        except AcquisitionError as failed:
-            if error is None:
-                raise
-            error.add_note(f"and the device could not be made safe: {failed}")
+            leave_safely(self.make_safe, error)
         finally:
             self.close()
 

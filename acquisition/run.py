@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from acquisition.contracts import AnyBench, Frame
-from acquisition.errors import AcquisitionError, DeviceLost, DeviceTimeout, FrameLost
+from acquisition.contracts import AnyBench, Frame, leave_safely
+from acquisition.errors import DeviceLost, DeviceTimeout, FrameLost
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
 from fibre import Calibration, Images, Recording
@@ -108,10 +108,7 @@ def _execute(
                 last = bench.time()
             bar.update()
     except BaseException as error:
-        try:
-            bench.make_safe()
-        except AcquisitionError as failed:
-            error.add_note(f"and the bench could not be made safe: {failed}")
+        leave_safely(bench.make_safe, error)
         raise
     finally:
         bar.close()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from acquisition.contracts import Camera, Device, Frame, PhaseModulator
+from acquisition.contracts import Camera, Device, Frame, PhaseModulator, leave_safely
 from acquisition.errors import AcquisitionError, SettingError
 from acquisition.exposure import MergeRule
 from acquisition.plan import Step, Views
@@ -140,11 +140,7 @@ class Bench:
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         try:
-            self.make_safe()
-        except AcquisitionError as failed:
-            if error is None:
-                raise
-            error.add_note(f"and the bench could not be made safe: {failed}")
+            leave_safely(self.make_safe, error)
         finally:
             for device in self.devices:
                 device.close()

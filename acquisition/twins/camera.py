@@ -92,6 +92,7 @@ class CameraTwin(UsbModel):
         self._late: deque[bytes] = deque()
         self._frame: deque[Any] = deque()
         self._pending_triggers = 0
+        self.acquiring = False
         self.memory: dict[int, int] = {}
         self._fill(code, xml, zipped)
 
@@ -189,8 +190,6 @@ class CameraTwin(UsbModel):
             self._frame.clear()
         self._sizes()
         return 0
-
-    acquiring = False
 
     def _sizes(self) -> None:
         payload = self.register("width") * self.register("height") * FORMATS[self.register("format")][0]
