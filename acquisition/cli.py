@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -118,20 +119,19 @@ def acquire_command(
         click.echo(f"at the published {Timing().image:.2f} s an image: {seconds / 60:.1f} minutes")
         if dry_run:
             return
-        bench = open_bench(devices, wanted)
-        try:
+        with contextlib.ExitStack() as stack:
+            bench = open_bench(devices, wanted)
+            if isinstance(bench, contextlib.AbstractContextManager):  # of devices, which are made safe and closed
+                stack.enter_context(bench)
             if preview is not None:
                 _preview(bench, wanted, preview)
                 click.echo(f"wrote {preview}")
+            record: object
             if isinstance(wanted, GridPlan):
-                record: object = calibrate(bench, wanted, folder, True, reference_seconds)
+                record = calibrate(bench, wanted, folder, True, reference_seconds)
             elif isinstance(wanted, SamplePlan):
                 record = capture(bench, wanted, folder, True, reference_seconds)
-        finally:
-            close = getattr(bench, "__exit__", None)
-            if close is not None:
-                close(None, None, None)
-        store = Folder(folder, {"plan": wanted.hash, "bench": bench.describe()})
+            store = Folder(folder, {"plan": wanted.hash, "bench": bench.describe()})
         size = sum(line["bytes"] for line in store.done.values())
         click.echo(f"{len(store.done)} captures, {size / 1e6:.0f} MB, in {folder}")
         if export is not None:

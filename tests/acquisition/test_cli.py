@@ -7,12 +7,14 @@ import pytest
 import usb.backend.libusb1
 from click.testing import CliRunner
 
+from acquisition import DeviceLost
 from acquisition.cli import acquire_command, devices_command
 from acquisition.planfile import open_bench, read_plan
 from acquisition.twins.backend import TwinBackend
 from acquisition.twins.camera import CameraTwin
 from acquisition.twins.instrument import InstrumentTwin
 from fibre import Calibration, Recording, load
+from tests.acquisition.test_devices import Linked, direct
 
 PLAN = """
 [plan]
@@ -133,3 +135,23 @@ def test_devices_are_listed_with_what_to_do(monkeypatch):
     backend.models.clear()
     assert "no device" in said(devices_command)
     assert "uaccess" in said(devices_command, "--rule")
+
+
+def test_a_bench_of_devices_is_captured_exported_and_closed(tmp_path, monkeypatch):
+    """Everything that needs the devices is asked before they are closed; afterwards they are."""
+    linked = Linked(direct)
+    monkeypatch.setattr("acquisition.planfile.open_bench", lambda devices, plan: linked.bench)
+    path = tmp_path / "sample.toml"
+    path.write_text("""[plan]
+kind = "sample"
+references = 1
+[plan.views]
+diversity = [-4e-5, 0.0, 4e-5]
+steps = [0.0, 2.0, 4.0]
+bracket = {longest = 64e-3, factor = 4.0, stop = 1e-3}
+""")
+    output = said(acquire_command, path, tmp_path / "run", "--export", tmp_path / "sample.nc")
+    assert "7 captures" in output
+    assert isinstance(load(tmp_path / "sample.nc"), Recording)
+    with pytest.raises(DeviceLost, match="closed"):
+        linked.bench.camera.snap(0.01)
