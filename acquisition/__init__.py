@@ -1,6 +1,7 @@
 """Capture: devices, benches, plans, exposures, runs; and a bench that is simulated whole."""
 
 from .bench.devices import Bench
+from .bench.modulators import ModulatorModel
 from .bench.scene import CameraModel, Scene
 from .bench.simulator import SimulatedBench
 from .contracts import AnyBench, Camera, Device, Frame, Instrument, PhaseModulator, Shown
@@ -71,6 +72,7 @@ __all__ = [
     "InverseVariance",
     "LongestUnsaturated",
     "Merged",
+    "ModulatorModel",
     "PatternPlan",
     "PhaseModulator",
     "PhotonTransfer",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
+from acquisition.bench.modulators import defocused, shown_spots
 from acquisition.bench.scene import Scene
 from acquisition.contracts import Frame
 from acquisition.exposure import InverseVariance, MergeRule
@@ -49,6 +50,7 @@ class SimulatedBench:
         settings = {
             f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
         }
+        settings |= {name: asdict(settings[name]) for name in ("hologram", "lens") if settings[name] is not None}
         bundle, coupling = self.scene.bundle, self.scene.bundle.coupling
         digest = hashlib.sha256()
         for part in (
@@ -91,12 +93,13 @@ class SimulatedBench:
         if step.kind == "spots":
             if points is None:
                 raise ValueError("points must be given for a step that lights spots.")
-            spots = scene.bundle.launch(points[list(step.points)], scene.spot_waist)
-            launched += np.outer(state, spots @ step.light)
+            launched += (scene.bundle.launch(points, scene.spot_waist) @ self._spots(step, state, points).T).T
         elif step.kind in ("blank", "sample"):
             places, light, jones, waist = self._sample[1:]
-            field = light[:, None] * state if step.kind == "blank" else light[:, None] * (jones @ state)
-            launched += (scene.bundle.launch(places, waist) @ field).T
+            field = self._arms(state, places)
+            if step.kind == "sample":
+                field = np.einsum("kij,jk->ik", jones, field)
+            launched += (scene.bundle.launch(places, waist) @ (light * field).T).T
         piston, tilt = self.drift(self._clock)
         turned = np.exp(1j * (piston + scene.bundle.centres @ tilt))
         self._rates = self._views(scene.bundle.transmit(launched) * turned, views, step)
@@ -121,6 +124,22 @@ class SimulatedBench:
 
     def make_safe(self) -> None:
         """See :class:`acquisition.contracts.AnyBench`: there is no light to turn off."""
+
+    def _arms(self, state: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """The state (2,) as it is at distal points, complex (2, p)."""
+        field = np.repeat(state[:, None], len(points), 1)
+        if any(self.scene.misalignment):
+            field = field * np.exp(1j * np.outer([0, 1], self.scene.between_arms(points)))
+        return field
+
+    def _spots(self, step: Step, state: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Complex amplitudes (2, p) of the spots that a step lights."""
+        scene, lit = self.scene, list(step.points)
+        light = np.zeros((2, len(points)), complex)
+        light[:, lit] = np.outer(state, step.light)
+        if scene.hologram is not None:
+            light = shown_spots(scene.hologram, points, light, scene.pitch, self.wavelength, scene.image_time)
+        return light * self._arms(np.ones(2), points)
 
     def _sample_field(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
         """Jones matrices on the grid, and places, light, Jones matrices and spot size of the finer sample."""
@@ -154,14 +173,31 @@ class SimulatedBench:
         generator = np.random.default_rng([self.seed, *np.frombuffer(key, np.uint32).tolist()])
         distances = np.array([0.0, *(d * (1 + scene.focus_error) + scene.focus_offset for d in views.diversity)])
         distances[0] = scene.focus_offset
-        seen = scene.bundle.image(amplitudes, camera.shape, camera.pixel_size, distances, scene.oversampling)
+        if scene.lens is None:
+            seen = scene.bundle.image(amplitudes, camera.shape, camera.pixel_size, distances, scene.oversampling)
+        else:
+            step_size = camera.pixel_size / scene.oversampling
+            focus = scene.bundle.image(amplitudes, camera.shape, camera.pixel_size, 0.0, scene.oversampling)
+            seen = defocused(scene.lens, focus, distances, self.wavelength, step_size, scene.image_time)
         rates = [np.abs(seen[1 + i, 0]) ** 2 for i in range(len(views.diversity))]
         errors = scene.step_error * generator.standard_normal(len(views.steps))
-        for phase in np.array(views.steps) + errors:
+        for phase in self._steps(views) + errors:
             rates.append(np.abs(seen[0, 0] + np.exp(1j * phase) * seen[0, 1]) ** 2 / 2)
         fine = scene.oversampling
         binned = np.stack(rates).reshape(len(rates), camera.shape[0], fine, camera.shape[1], fine).mean((2, 4))
-        return scene.spot_power * camera.pixel_size**2 * binned
+        return scene.spot_power * camera.quantum_efficiency * camera.pixel_size**2 * binned
+
+    def _steps(self, views: Views) -> np.ndarray:
+        """Phase steps as the lens's modulator shows them, (k,) radians."""
+        lens, steps = self.scene.lens, np.array(views.steps)
+        if lens is None:
+            return steps
+        # a phase that is the same in all pixels: no crosstalk
+        shown, last = [], 0.0
+        for grey in lens.addressed(steps):
+            last = grey + lens.left(self.scene.image_time) * (last - grey)
+            shown.append(last)
+        return np.array(shown)
 
 
 def _shot_noise(mean: np.ndarray, generator: np.random.Generator) -> np.ndarray:

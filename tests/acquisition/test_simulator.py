@@ -223,6 +223,7 @@ def test_benches_that_make_other_frames_describe_themselves_otherwise(name):
         (lambda: bench(oversampling=0), ValueError, "oversampling must be >= 1"),
         (lambda: bench(camera={"bits": 17}), ValueError, "bits must be from 1 to 16"),
         (lambda: bench(camera={"gain": 0.0}), ValueError, "gain must be > 0"),
+        (lambda: bench(camera={"quantum_efficiency": 1.2}), ValueError, "quantum_efficiency must be <= 1"),
         (lambda: bench(camera={"read_noise": -1.0}), ValueError, "read_noise must be >= 0"),
     ],
 )
