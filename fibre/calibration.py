@@ -6,8 +6,10 @@ the recovery methods.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -32,6 +34,20 @@ __all__ = [
 
 DENSE = 2.0  # fibrelets between neighbouring spots, below which no fibrelet belongs to a single spot
 PATTERN_REACH = 8.0  # fibrelets: how far coupling is looked for where patterns are lit
+FAINT = 1e-5  # of the coupling's peak: fainter responses are left out
+
+_MADE: dict[int, dict[str, Any]] = {}
+
+
+def _once(fields: CalibrationFields, name: str, make: Callable[[], Any]) -> Any:
+    """What is made once of a calibration, and forgotten with it; a record's arrays do not change."""
+    if id(fields) not in _MADE:
+        _MADE[id(fields)] = {}
+        weakref.finalize(fields, _MADE.pop, id(fields), None)
+    made = _MADE[id(fields)]
+    if name not in made:
+        made[name] = make()
+    return made[name]
 
 
 @dataclass(frozen=True)
@@ -108,8 +124,12 @@ def coupling_profile(fields: CalibrationFields) -> Profile:
     Every fibrelet of a capture is ascribed to the lit point that is nearest; squared amplitudes, less their noise, are
     averaged in bins of distance and made to fall monotonically. Near the middle between two spots both contribute, so
     the profile is a little too broad there: a weaker prior, not a wrong one. Spots nearer than two fibrelets to each
-    other: :func:`profile_of_patterns`.
+    other: :func:`profile_of_patterns`. Made once for a calibration.
     """
+    return _once(fields, "profile", lambda: _coupling_profile(fields))
+
+
+def _coupling_profile(fields: CalibrationFields) -> Profile:
     positions, clean = positions_on_camera(fields), clean_fibrelets(fields)
     centres = fields.fibrelets.centres[clean]
     distance, power, weight = [], [], []
@@ -242,7 +262,7 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         yield _Regressions(cores, chosen, root, scaled, weight, systems)
 
 
-def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128) -> Columns:
+def columns(fields: CalibrationFields, fraction: float = FAINT, chunk: int = 128) -> Columns:
     r"""Columns of A by linear regression with a local prior, one fibrelet at a time.
 
     A fibrelet's amplitude in capture c is :math:`y_c = \sum_j A_j x_{jc} + n_c` over all points j lit within reach.
@@ -255,7 +275,12 @@ def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128)
     so spots that were lit together are told apart as well as the translations allow, and what stays ambiguous between
     them is in the covariance. Points beyond the distance at which the profile has fallen to ``fraction`` of its peak
     are left out. Fibrelets that carry the reference spot get no columns. ``chunk`` fibrelets are worked on at a time.
+    Made once for a calibration.
     """
+    return _once(fields, f"columns, {fraction!r}", lambda: _columns(fields, fraction, chunk))
+
+
+def _columns(fields: CalibrationFields, fraction: float, chunk: int) -> Columns:
     count, cores = len(fields.points), len(fields.fibrelets.centres)
     rows, cols, values, variances = [], [], [], []
     for part in _regressions(fields, fraction, chunk):
@@ -280,28 +305,37 @@ def columns(fields: CalibrationFields, fraction: float = 1e-5, chunk: int = 128)
 
 
 def response_covariance(
-    fields: CalibrationFields, inputs: np.ndarray, fraction: float = 1e-5, chunk: int = 128
+    fields: CalibrationFields, inputs: np.ndarray, fraction: float = FAINT, chunk: int = 128
 ) -> np.ndarray:
     r"""How uncertain the calibration leaves each fibrelet's response to given distal fields.
 
     For fields Z (2 p, s) and the error :math:`\delta A` of a row of A, :math:`E[(\delta A Z)^H \delta A Z] = Z^H \Sigma
     Z` with the covariance of :func:`columns`: complex (2 m, s, s), rows h of all fibrelets then v, 0 where there are
-    no columns. Errors of different rows are independent.
+    no columns. Errors of different rows are independent. What does not depend on Z is made once for a calibration.
     """
     inputs = np.vstack([inputs, np.zeros(inputs.shape[1])])
     cores = len(fields.fibrelets.centres)
     covariance = np.zeros((2 * cores, inputs.shape[1], inputs.shape[1]), complex)
-    for part in _regressions(fields, fraction, chunk):
-        z = part.root[..., None] * inputs[part.chosen]
-        for polarisation in range(2):
-            covariance[polarisation * cores + part.cores] = z.conj().swapaxes(-1, -2) @ np.linalg.solve(
-                part.systems[polarisation], z
-            )
+    name = f"roots of the covariance, {fraction!r}"
+    for rows, chosen, roots in _once(fields, name, lambda: list(_covariance_roots(fields, fraction, chunk))):
+        whitened = roots @ inputs[chosen]
+        covariance[rows] = whitened.conj().swapaxes(-1, -2) @ whitened
     return covariance
 
 
+def _covariance_roots(
+    fields: CalibrationFields, fraction: float, chunk: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    r"""Rows of A (k,), the inputs that reach them (k, 2 q), and roots of their covariance: :math:`\Sigma = W^H W`."""
+    cores = len(fields.fibrelets.centres)
+    for part in _regressions(fields, fraction, chunk):
+        for polarisation in range(2):
+            factor = np.linalg.inv(np.linalg.cholesky(part.systems[polarisation]))
+            yield polarisation * cores + part.cores, part.chosen, factor * part.root[:, None]
+
+
 def usual_response(
-    fields: CalibrationFields, inputs: np.ndarray, fraction: float = 1e-5, chunk: int = 128
+    fields: CalibrationFields, inputs: np.ndarray, fraction: float = FAINT, chunk: int = 128
 ) -> np.ndarray:
     r"""Covariance of responses to given distal fields before looking closer: :math:`Z^H T Z`.
 
