@@ -30,7 +30,7 @@ from fibre.records import (
     Recording,
     RecordingFields,
 )
-from fibre.retrieval.base import RetrievalMethod, retrieve
+from fibre.retrieval.base import ModeMethod, RetrievalMethod, retrieve
 from polinfer.checks import one_of_types
 from polinfer.kept import Kept, fingerprint
 from polinfer.storage import array
@@ -340,7 +340,9 @@ class _Run:
 
     def amplitudes(self, images: Images, name: str) -> _Amplitudes:
         """Of all captures, with the drift taken out; those that are in the folder are not retrieved again."""
-        basis = ModeBasis(mode_matrix(self.fibrelets, images.frame, images.pixel_size))
+        basis = None
+        if not self._in_modes():
+            basis = ModeBasis(mode_matrix(self.fibrelets, images.frame, images.pixel_size))
         kept = None if self.folder is None else self._kept(images, name)
         done = []
         with tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not self.progress) as bar:
@@ -387,8 +389,19 @@ class _Run:
         call = fingerprint(shape, settings, ends, self.method, self.fibrelets, self.batch)
         return Kept(Path(self.folder or "") / name, call, (_Amplitudes,), "record, method or set of fibrelets")
 
-    def _batch(self, images: Images, part: range, basis: ModeBasis) -> _Amplitudes:
-        """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones."""
+    def _in_modes(self) -> bool:
+        """Whether the method finds the amplitudes of these very fibrelets itself."""
+        if not isinstance(self.method, ModeMethod):
+            return False
+        theirs, ours = self.method.fibrelets, self.fibrelets
+        return np.array_equal(theirs.centres, ours.centres) and np.array_equal(theirs.mode_radius, ours.mode_radius)
+
+    def _batch(self, images: Images, part: range, basis: ModeBasis | None) -> _Amplitudes:
+        """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones; ``basis`` where
+        the method makes fields on the camera's pixels."""
+        if basis is None:
+            assert isinstance(self.method, ModeMethod)
+            return _Amplitudes(*self.method.amplitudes(images, part))
         planes = len(images.diversity)
         # all of one capture before the next: a lazy stack makes its three parts together
         read = [(images.radiance[c], images.variance[c], images.saturated[c]) for c in part]

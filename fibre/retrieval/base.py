@@ -16,10 +16,20 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from fibre.records import Diversity, RetrievalStatus, Retrieved
+from fibre.records import Diversity, Fibrelets, Images, RetrievalStatus, Retrieved
 from polinfer.checks import one_of_types
 
-__all__ = ["RetrievalMethod", "Solution", "Stack", "judged", "measured_amplitudes", "misfit", "retrieve"]
+__all__ = [
+    "Amplitudes",
+    "ModeMethod",
+    "RetrievalMethod",
+    "Solution",
+    "Stack",
+    "judged",
+    "measured_amplitudes",
+    "misfit",
+    "retrieve",
+]
 
 
 class RetrievalMethod(ABC):
@@ -28,6 +38,24 @@ class RetrievalMethod(ABC):
     @abstractmethod
     def solve(self, stack: Stack) -> Solution:
         """Fields of a small batch."""
+
+
+class Amplitudes(NamedTuple):
+    """Of some captures: values complex (b, 2, m), their variance, status (b,), :class:`fibre.RetrievalStatus`."""
+
+    values: np.ndarray
+    variance: np.ndarray
+    status: np.ndarray
+
+
+class ModeMethod(RetrievalMethod):
+    """A method that finds the amplitudes of fibrelet modes, so that no field on the camera's pixels is needed."""
+
+    fibrelets: Fibrelets
+
+    @abstractmethod
+    def amplitudes(self, images: Images, captures: range) -> Amplitudes:
+        """Amplitudes in both polarisations from the defocused and the phase-stepped images of some captures."""
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,10 @@ def test_views_are_the_bundles_and_their_adjoint_is_one(near):
         rng = np.random.default_rng(0)
         x = rng.standard_normal(BUNDLE.cores) + 1j * rng.standard_normal(BUNDLE.cores)
         y = (rng.standard_normal(fields.shape) + 1j * rng.standard_normal(fields.shape)).astype(np.complex64)
-        ahead, back = np.vdot(y, views.fields(views.spectrum(x))), np.vdot(views.adjoint(y.copy()), x)
+        total = np.zeros(fields.shape[1:], np.complex64)
+        for i, field in enumerate(y.copy()):
+            views.collect(total, field, i)
+        ahead, back = np.vdot(y, views.fields(views.spectrum(x))), np.vdot(views.amplitudes(total), x)
         assert abs(ahead - back) < 1e-5 * np.linalg.norm(y) * np.linalg.norm(x)
 
 
@@ -123,6 +126,13 @@ def test_derivatives_are_those_of_the_images(near):
     state = _State(views, problem, Found(c, 2e-6, gains))
     by_hand = (residual(c + h * step, 2e-6, gains) - residual(c - h * step, 2e-6, gains)) / (2 * h)
     assert np.linalg.norm(state.forward(step) - by_hand) < 2e-3 * np.linalg.norm(by_hand)
+    back = state.adjoint(state.forward(step))
+    assert np.vdot(step, back).real == pytest.approx(float((by_hand**2).sum()), rel=5e-3)
+    np.testing.assert_allclose(state.curvature(step, np.arange(7)), back, rtol=1e-3, atol=1e-4 * np.abs(back).max())
+    one = state.curvature(step, np.array([2]))
+    assert np.vdot(step, one).real == pytest.approx(7 * float((by_hand[2] ** 2).sum()), rel=1e-2)
+    slope = np.vdot(state.gradient(), step).real
+    assert slope == pytest.approx(float((residual(c, 2e-6, gains) * by_hand).sum()), rel=5e-3)
     focus, *each = state.nuisance()
     by_hand = (residual(c, 2.05e-6, gains) - residual(c, 1.95e-6, gains)) / 0.1
     assert np.linalg.norm(focus - by_hand) < 2e-2 * np.linalg.norm(by_hand)

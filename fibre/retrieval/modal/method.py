@@ -14,9 +14,10 @@ import scipy.sparse.linalg
 import scipy.spatial
 
 from fibre.propagation import phase_per_metre
-from fibre.records import Fibrelets
-from fibre.retrieval.base import RetrievalMethod, Solution, Stack, judged, measured_amplitudes
+from fibre.records import Fibrelets, Images, RetrievalStatus
+from fibre.retrieval.base import Amplitudes, ModeMethod, Solution, Stack
 from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
+from fibre.retrieval.modal.captures import defocus_masks, second_polarisation
 from fibre.retrieval.modal.newton import Coupling, Found, Problem, make_coupling, refine
 from fibre.retrieval.modal.start import Neighbours, make_neighbours, spreads, synchronise
 from fibre.retrieval.modal.views import Views, coarse_images, coarse_variance, make_views
@@ -28,7 +29,7 @@ MOST = 20  # Gerchberg-Saxton sweeps where no image is local
 
 
 @dataclass(frozen=True)
-class Modal(RetrievalMethod):
+class Modal(ModeMethod):
     r"""The complex amplitudes of the fibrelet modes that explain the images best.
 
     The field is :math:`E = \sum_k c_k \psi_k` with Gaussian modes :math:`\psi_k` at known places, so thousands of
@@ -101,17 +102,51 @@ class Modal(RetrievalMethod):
             with scipy.fft.set_workers(max(1, cores // count)):
                 images, spread = _coarse(stack, k, geometry.views.step)
                 found = self._found(stack, k, geometry, images, spread)
-                misfitted = stack.variance is not None and _misfits(found, geometry, images, spread)
+                misfitted = stack.variance is not None and _judged(found, images, spread)[1]
             return found, misfitted
 
         # a field to a thread: nearly all is inside FFTs and sparse products, which let other threads run
         with ThreadPoolExecutor(min(count, cores)) as pool:
             found, misfitted = zip(*pool.map(one, range(count)), strict=True)
         field = np.stack([geometry.camera.focus(each.amplitudes) for each in found])
-        converged = np.array([each.step <= max(self.tolerance, 2e-2) for each in found])
+        converged = np.array([self._converged(each) for each in found])
         steps = np.array([each.steps for each in found])
         known = None if stack.variance is None else np.array(misfitted)
         return Solution(field, converged, steps, misfitted=known)
+
+    def amplitudes(self, images: Images, captures: range) -> Amplitudes:
+        """See :meth:`ModeMethod.amplitudes`."""
+        planes, distances = len(images.diversity), np.asarray(images.diversity, float)
+        masks = defocus_masks(images.frame, distances.tobytes(), images.wavelength, images.pixel_size)
+        cores = os.cpu_count() or 1
+
+        def one(radiance: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+            with scipy.fft.set_workers(max(1, cores // len(captures))):
+                stack = Stack(radiance[None, :planes], noise[None, :planes], masks, distances, images.wavelength,
+                              images.pixel_size)  # fmt: skip
+                geometry = _geometry(self, stack)
+                coarse, spread = _coarse(stack, 0, geometry.views.step)
+                found = self._found(stack, 0, geometry, coarse, spread)
+                floor, misfitted = _judged(found, coarse, spread)
+                # a coarse pixel is the mean of step^2 of the camera's, and modes are of unit power over those
+                floor = min(floor * geometry.views.step**2, float((np.abs(found.amplitudes) ** 2).sum()) + 1e-300)
+                second, variance = second_polarisation(
+                    geometry.views, found.amplitudes, floor, radiance[planes:], noise[planes:], images.steps
+                )
+            status = 0 if self._converged(found) else int(RetrievalStatus.NOT_CONVERGED)
+            status |= int(RetrievalStatus.MISFIT) if misfitted else 0
+            both = np.stack([found.amplitudes, second]), np.stack([np.full(variance.shape, floor), variance])
+            return *both, status
+
+        # one more than there are cores: three captures end together on two
+        with ThreadPoolExecutor(min(len(captures), cores + 1)) as pool:
+            # read here, one after the other: a lazy stack makes its parts together, and not in two threads
+            tasks = [pool.submit(one, *_read(images, c)) for c in captures]
+            values, variances, status = zip(*(task.result() for task in tasks), strict=True)
+        return Amplitudes(np.stack(values), np.stack(variances), np.array(status, np.uint8))
+
+    def _converged(self, found: Found) -> bool:
+        return found.step <= max(self.tolerance, 2e-2)
 
     def _found(self, stack: Stack, k: int, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> Found:
         """Amplitudes of field ``k``, and what was found of the bench, from images and variances of the coarse grid.
@@ -196,13 +231,38 @@ def _made(key: _Key) -> Geometry:
                     make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn.astype(np.float32))  # fmt: skip
 
 
-def _misfits(found: Found, geometry: Geometry, images: np.ndarray, spread: np.ndarray) -> bool:
-    """Whether images and field differ by more than noise, on the coarse grid, with the bench as it was found."""
-    views = geometry.views
-    measured = measured_amplitudes(images[None] / found.gains[:, None, None].astype(np.float32), spread[None])
-    turned = np.exp(1j * found.focus * geometry.turn).astype(np.complex64) if found.focus else np.complex64(1)
-    _, misfitted = judged(views.focus(found.amplitudes)[None], measured, views.masks * turned)
-    return bool(misfitted[0])
+def _judged(found: Found, images: np.ndarray, spread: np.ndarray) -> tuple[float, bool]:
+    """As :func:`fibre.retrieval.base.judged`, of images on the coarse grid (image, y, x) and what was found of them:
+    variance of the field from the noise of the images, and whether field and images differ by more."""
+    if found.powers is None:
+        return np.inf, False
+    total = left = light = 0.0
+    count = 0
+    for image, variance, power, gain in zip(images, spread, found.powers, found.gains, strict=True):
+        amplitude, weight, usable = _amplitude_weights(image / np.float32(gain), variance)
+        total += float(weight.sum(dtype=float))
+        left += float(np.vdot(weight, (np.sqrt(power) - amplitude) ** 2))
+        light += float(np.vdot(weight, amplitude**2))
+        count += usable
+    expected = count / max(total, 1e-300)
+    return 2 * expected / len(images), left > 2 * count + 0.01 * light
+
+
+def _amplitude_weights(image: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Amplitudes of an image, their inverse variances, and how many are usable."""
+    usable = np.isfinite(variance)
+    known = np.where(usable, variance, 1)
+    # near zero intensity the square root is no longer linear: its error is at most sqrt(deviation)
+    weight = np.where(usable, 4 * np.maximum(image, np.sqrt(known)) / known, 0)
+    return np.sqrt(np.maximum(image, 0)), weight, int(np.count_nonzero(usable))
+
+
+def _read(images: Images, capture: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance of a capture and its variance, infinite where saturated, float32 (image, y, x)."""
+    radiance = np.asarray(images.radiance[capture], np.float32)
+    noise = np.array(images.variance[capture], np.float32)
+    noise[np.asarray(images.saturated[capture])] = np.inf
+    return radiance, noise
 
 
 def _coarse(stack: Stack, k: int, step: int) -> tuple[np.ndarray, np.ndarray]:

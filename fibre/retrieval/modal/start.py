@@ -136,7 +136,7 @@ def synchronise(pairs: np.ndarray, powers: np.ndarray, products: np.ndarray, rou
     """
     count, strength, angle = len(powers), np.abs(products), np.angle(products)
     i, j = pairs.T
-    phase = np.zeros(count)
+    phase, above = np.zeros(count), np.arange(count)
     cost = 1 / np.maximum(strength, 1e-9 * strength.max() + 1e-300)
     tree = scipy.sparse.csgraph.minimum_spanning_tree(scipy.sparse.csr_array((cost, (i, j)), shape=(count, count)))
     number = scipy.sparse.csr_array((np.arange(1, len(i) + 1), (i, j)), shape=(count, count))
@@ -147,9 +147,11 @@ def synchronise(pairs: np.ndarray, powers: np.ndarray, products: np.ndarray, rou
         mother = parent[child]
         forward = np.asarray(number[child, mother]).ravel()
         backward = np.asarray(number[mother, child]).ravel()
-        step = np.where(forward > 0, angle[forward - 1], -angle[backward - 1])
-        for k, above, turn in zip(child.tolist(), mother.tolist(), step.tolist(), strict=True):
-            phase[k] = phase[above] + turn
+        phase[child] = np.where(forward > 0, angle[forward - 1], -angle[backward - 1])
+        above[child], above[root] = mother, root
+    # every node adds what its ancestor has, which then stands for twice as many steps up the tree
+    while np.any(above != above[above]):
+        phase, above = phase + np.where(above == np.arange(count), 0, phase[above]), above[above]
     diagonal = np.arange(count)
     for _ in range(rounds):
         left = np.angle(np.exp(1j * (angle - phase[i] + phase[j])))
@@ -160,5 +162,7 @@ def synchronise(pairs: np.ndarray, powers: np.ndarray, products: np.ndarray, rou
             (np.r_[-weight, -weight, total * (1 + 1e-9)], (np.r_[i, j, diagonal], np.r_[j, i, diagonal]))
         )
         pull = np.bincount(i, weight * left, count) - np.bincount(j, weight * left, count)
-        phase = phase + splu(laplacian).solve(pull)
+        phase = phase + splu(
+            laplacian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        ).solve(pull)
     return np.sqrt(np.maximum(powers, 0)) * np.exp(1j * phase)
