@@ -19,6 +19,7 @@ ALL = (
     "intensities",
     "peers",
     "chain",
+    "maps",
     "parts",
     "hard_cases",
     "ordering",

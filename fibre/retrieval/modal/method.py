@@ -260,8 +260,9 @@ def _amplitude_weights(image: np.ndarray, variance: np.ndarray) -> tuple[np.ndar
 def _read(images: Images, capture: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of a capture and its variance, infinite where saturated, float32 (image, y, x)."""
     radiance = np.asarray(images.radiance[capture], np.float32)
-    noise = np.array(images.variance[capture], np.float32)
-    noise[np.asarray(images.saturated[capture])] = np.inf
+    noise, saturated = np.asarray(images.variance[capture], np.float32), np.asarray(images.saturated[capture])
+    if np.any(np.isfinite(noise[saturated])):
+        noise = np.where(saturated, np.float32(np.inf), noise)
     return radiance, noise
 
 
