@@ -20,6 +20,7 @@ ALL = (
     "peers",
     "chain",
     "maps",
+    "stored",
     "parts",
     "hard_cases",
     "ordering",

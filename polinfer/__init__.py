@@ -2,6 +2,7 @@
 
 from . import contrast, conventions, datasets, phantoms, texture
 from .bounds import cramer_rao_bound, tilt_bound
+from .chunked import Stored, fit_stored
 from .comparison import Comparison, compare, ordering_screen, power, select
 from .decomposition import decompose, ordering_error
 from .degeneracy import canonicalise, orbit
@@ -41,6 +42,7 @@ __all__ = [
     "RetarderFirst",
     "RotatedBasis",
     "Status",
+    "Stored",
     "TiltPlane",
     "TruncatedNormal",
     "UniformAngle",
@@ -55,6 +57,7 @@ __all__ = [
     "datasets",
     "decompose",
     "fit",
+    "fit_stored",
     "load",
     "orbit",
     "ordering_error",

@@ -27,6 +27,7 @@ from .kept import fingerprint
 from .misalignment import TiltPlane
 from .model import Model
 from .noise import InferredNoise
+from .precision import double_precision, is_double
 from .records import Fit, Measurement, Status
 
 __all__ = ["Stored", "fit_stored"]
@@ -106,9 +107,12 @@ class Stored:
         group.attrs.update(dataset.attrs)
         return cls(path)
 
-    def read(self, block: Block) -> Any:
-        """The record of a block of pixels, one slice an axis."""
-        return storage.from_dataset(self._dataset.isel(self._chosen(block)), self._classes)
+    def read(self, block: Block, **instead: Any) -> Any:
+        """The record of a block of pixels, one slice an axis; ``instead``: values for all of a variable by its name."""
+        dataset = self._dataset.isel(self._chosen(block))
+        for name, value in instead.items():
+            dataset = dataset.assign({name: dataset[name].copy(data=np.full(dataset[name].shape, value))})
+        return storage.from_dataset(dataset, self._classes)
 
     def write(self, block: Block, record: Any, without: tuple[str, ...] = ()) -> None:
         """Write the record of a block, but for the variables whose names begin with one of ``without``."""
@@ -126,13 +130,6 @@ class Stored:
                 place = tuple(chosen.get(str(d), slice(None)) for d in variable.dims)
                 array: Any = group[str(name)]
                 array[place] = variable.values
-
-    def set(self, block: Block, name: str, value: float) -> None:
-        """One value for all pixels of a block of one variable."""
-        import zarr
-
-        array: Any = zarr.open_group(self.path, mode="r+")[name]
-        array[tuple(block)] = value
 
     def _chosen(self, block: Block) -> dict[str, slice]:
         if len(block) != len(self.shape):
@@ -244,7 +241,7 @@ class _Call:
 
     def __init__(self, model: Model, source: Path, part: Path, covariance: bool, classes: tuple[type, ...]) -> None:
         self.model, self.source, self.part = model, source.resolve(), part.resolve()
-        self.covariance, self.classes = covariance, classes
+        self.covariance, self.classes, self.double = covariance, classes, is_double()
 
 
 def _in_turn(common: _Call, tasks: list[Block]) -> Iterator[tuple[int, None]]:
@@ -286,7 +283,12 @@ def _unless_masked(data: Stored, block: Block) -> Measurement | None:
 
 
 def _fitted(common: _Call, block: Block) -> None:
-    """Fit one block, with what its windows need around it, and write it."""
+    """Fit one block, with what its windows need around it, in the precision of the caller, and write it."""
+    with double_precision(common.double):
+        _fitted_so(common, block)
+
+
+def _fitted_so(common: _Call, block: Block) -> None:
     data, target = Stored(common.source, common.classes), Stored(common.part)
     window = common.model.neighbours
     reach = [0] * len(block)
@@ -296,9 +298,12 @@ def _fitted(common: _Call, block: Block) -> None:
                    for b, r, n in zip(block, reach, data.shape, strict=True))  # fmt: skip
     measurement = _unless_masked(data, around)
     if measurement is None:
-        target.set(block, "status", int(Status.MASKED))
-        return
-    found = fit(common.model, measurement)
+        # nothing of it can be used: as if there were no data
+        dark = data.read(around, mask=True)
+        found = fit(common.model, replace(dark, response=np.full_like(dark.response, np.nan)))
+        found = replace(found, status=np.full_like(found.status, int(Status.MASKED)))
+    else:
+        found = fit(common.model, measurement)
     inner = tuple(slice(b.start - a.start, b.stop - a.start) for b, a in zip(block, around, strict=True))
     target.write(block, _cut(found, inner), () if common.covariance else ("covariance",))
 

@@ -37,6 +37,10 @@ class _Frozen(dict):
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(tuple(sorted(self.items(), key=lambda item: item[0])))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # a model travels to other processes, where its dictionaries are made whole at once
+        return type(self), (dict(self),)
+
     def __setitem__(self, key: Any, value: Any) -> None:
         raise TypeError("a Model does not change; make another one with the priors or fixed values you want.")
 
