@@ -55,6 +55,12 @@ def _tell_tilt(tilt: Any) -> None:
     help="Which of the equivalent parameters the picture shows: smooth maps, or what OUT holds.",
 )
 @click.option("--pixel-size", type=float, help="Side of a pixel in micrometres, for a scale bar in the picture.")
+@click.option(
+    "--pixels-at-a-time",
+    type=click.IntRange(min=1),
+    help="Fit so many pixels after the other from disk, for frames larger than memory: both files end in .zarr. The "
+    "same command goes on where it was interrupted.",
+)
 @overwrite_option
 @click.option("--progress/--no-progress", default=True, show_default=True, help="Show a progress bar.")
 def fit_command(
@@ -63,6 +69,7 @@ def fit_command(
     picture: Path | None,
     smooth: bool | None,
     pixel_size: float | None,
+    pixels_at_a_time: int | None,
     overwrite: bool,
     progress: bool,
     **declared: Any,
@@ -74,10 +81,13 @@ def fit_command(
     Example: polinfer fit measurement.nc result.nc --window 3 5 --fix diattenuation=0
 
     Example: polinfer fit measurement.nc result.nc --tilt plane
+
+    Example: polinfer fit huge.zarr result.zarr --pixels-at-a-time 1000000
     """
     import numpy as np
 
     from .. import storage
+    from ..chunked import fit_stored
     from ..fitting import fit
     from ..records import PERIODS, Parameters, Status
 
@@ -85,6 +95,14 @@ def fit_command(
         raise click.UsageError("the gauge and --pixel-size are only for --picture.")
     model = declared_model(**declared)
     vacant(out, overwrite)
+    if pixels_at_a_time is not None:
+        if picture is not None or overwrite:
+            raise click.UsageError("--pixels-at-a-time draws no picture and replaces nothing.")
+        try:
+            click.echo(f"wrote {fit_stored(model, measurement, out, pixels_at_a_time, progress=progress)}")
+        except (ValueError, FileNotFoundError) as error:
+            raise click.UsageError(str(error)) from error
+        return
     data = measurement_of(measurement, declared)
     result = fit(model, data, progress=progress)
     storage.save(result, out, overwrite=overwrite)

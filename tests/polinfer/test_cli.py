@@ -36,6 +36,19 @@ def test_fit_writes_the_same_result_as_the_library_and_a_picture(measurement, tm
     np.testing.assert_array_equal(polinfer.load(out).parameters.retardance, expected.parameters.retardance)
 
 
+def test_fit_from_disk_writes_the_same_result(measurement, tmp_path):
+    source, out = polinfer.save(polinfer.load(measurement), tmp_path / "data.zarr"), tmp_path / "fit.zarr"
+    result = run("fit", source, out, *SHARED, "--pixels-at-a-time", "10", "--no-progress")
+    assert result.exit_code == 0, result.output
+    expected = polinfer.fit(Model(PolariserFirst(), gain=ComplexGain(0.8)), polinfer.load(measurement))
+    found = polinfer.load(out)
+    np.testing.assert_allclose(found.parameters.retardance, expected.parameters.retardance, rtol=1e-6)
+    for options in (("--picture", tmp_path / "a.png"), ("--tilt", "plane")):
+        refused = run("fit", source, tmp_path / "b.zarr", "--pixels-at-a-time", "10", *options)
+        assert refused.exit_code == 2
+        assert "pixels" in refused.output
+
+
 def test_sample_writes_the_draws_of_the_library_and_says_what_they_hold(measurement, tmp_path):
     out, picture = tmp_path / "draws.nc", tmp_path / "posterior.png"
     sizes = ("--chains", "2", "--draws", "40", "--seed", "3")
