@@ -6,7 +6,7 @@ from . import holograms
 from .bundle import Bundle
 from .drift import Drift, track_drift
 from .fibrelets import find_fibrelets
-from .fields import retrieve_fields, retrieve_sample
+from .fields import fibrelets_of, retrieve_fields, retrieve_sample
 from .files import load
 from .imaging import TransmissionImage, transmission_image
 from .interference import relative_phase
@@ -79,6 +79,7 @@ __all__ = [
     "WeightedSum",
     "angular_spectrum",
     "basis_pursuit_denoise",
+    "fibrelets_of",
     "find_fibrelets",
     "holograms",
     "load",

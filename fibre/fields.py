@@ -317,7 +317,17 @@ def tracked_drift(references: np.ndarray, times: np.ndarray, fibrelets: Fibrelet
 
 
 def fibrelets_of(calibration: Calibration) -> Fibrelets:
-    """Fibrelets in the sum of all interference images: every capture lights others, and incoherent sums are even."""
+    """The fibrelets that a calibration shows, as :func:`retrieve_fields` finds them; methods such as ``Modal`` ask for
+    them first.
+
+    They are looked for in the sum of all interference images: every capture lights others, and incoherent sums are
+    even.
+
+    Raises
+    ------
+    TypeError: no Calibration. ValueError: no fibrelet is seen.
+    """
+    one_of_types("calibration", calibration, (Calibration,), "pass a Calibration.")
     images = calibration.images
     total = np.zeros(images.frame)
     for capture in range(images.captures):

@@ -86,6 +86,15 @@ class SimulatedBench:
 
     def prepare(self, step: Step, views: Views, illumination: np.ndarray, points: np.ndarray | None) -> None:
         """See :class:`acquisition.contracts.AnyBench`."""
+        piston, tilt = self.drift(self._clock)
+        turned = np.exp(1j * (piston + self.scene.bundle.centres @ tilt))
+        self._rates = self._views(self.amplitudes(step, illumination, points) * turned, views, step)
+        self._step, self._view = step, -1
+
+    def amplitudes(self, step: Step, illumination: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+        """The truth of a capture: mode amplitudes at the proximal facet without drift, complex (2, m), in units of a
+        calibration spot; times the root of the scene's ``spot_power`` and of the camera's quantum efficiency they are
+        in sqrt(photo-electrons/s). Arguments as for :meth:`prepare`. ValueError without ``points`` for spots."""
         scene = self.scene
         state = illumination[:, step.state]
         spot = scene.bundle.launch(np.array([scene.reference]), scene.spot_waist)
@@ -100,10 +109,7 @@ class SimulatedBench:
             if step.kind == "sample":
                 field = np.einsum("kij,jk->ik", jones, field)
             launched += (scene.bundle.launch(places, waist) @ (light * field).T).T
-        piston, tilt = self.drift(self._clock)
-        turned = np.exp(1j * (piston + scene.bundle.centres @ tilt))
-        self._rates = self._views(scene.bundle.transmit(launched) * turned, views, step)
-        self._step, self._view = step, -1
+        return np.asarray(scene.bundle.transmit(launched))
 
     def expose(self, view: int, exposure: float) -> Frame:
         """See :class:`acquisition.contracts.AnyBench`."""
