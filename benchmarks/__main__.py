@@ -1,5 +1,5 @@
-"""Run benchmarks: ``python -m benchmarks [NAME ...]``; without names, those that take minutes, not hours: some
-twenty together."""
+"""Run benchmarks: ``python -m benchmarks [NAME ...]``; without names a quick round of one for each part, below ten
+minutes on two cores."""
 
 from __future__ import annotations
 
@@ -9,9 +9,22 @@ import inspect
 
 import jax
 
-QUICK = ("speed", "optimum", "evidence", "accuracy", "retrieval")
+from benchmarks.results import keep
+
+# by name, with a size where the benchmark's own takes long
+QUICK: dict[str, dict[str, int]] = {
+    "speed": {},
+    "accuracy": {},
+    "retrieval": {"size": 240},
+    "stored": {},
+    "streaming": {},
+}
 ALL = (
-    *QUICK,
+    "speed",
+    "optimum",
+    "evidence",
+    "accuracy",
+    "retrieval",
     "bundle",
     "images",
     "recovery",
@@ -43,6 +56,9 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help=f"of {', '.join(ALL)}; default: {', '.join(QUICK)}")
     parser.add_argument("--size", type=int, help="pixels, instead of each script's own number")
     parser.add_argument("--full", action="store_true", help="all pixels and cases; up to an hour a script")
+    parser.add_argument(
+        "--page", action="store_true", help="then rewrite docs/results.md, with ratios to the figures it had"
+    )
     given = parser.parse_args()
     unknown = sorted(set(given.names) - set(ALL))
     if unknown:
@@ -51,7 +67,13 @@ def main() -> None:
     options = {"size": given.size, "full": given.full}
     for name in given.names or QUICK:
         function = importlib.import_module(f"benchmarks.{name}").main
-        function(**{key: value for key, value in options.items() if key in inspect.signature(function).parameters})
+        own = {} if given.names else QUICK[name]
+        takes = inspect.signature(function).parameters
+        function(**{key: value for key, value in (options | own).items() if key in takes})
+        if given.page:
+            size = own.get("size", given.size)
+            arguments = ("" if size is None else f" --size {size}") + (" --full" if given.full else "")
+            print(f"wrote {keep([name], arguments)}")
 
 
 if __name__ == "__main__":

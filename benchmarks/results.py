@@ -1,4 +1,5 @@
-"""Timing, bars, fresh processes, and where results go: a printed table, JSON beside it, and a picture."""
+"""Timing, bars, fresh processes, and where results go: a printed table, JSON beside it, a picture, and a page of the
+documentation with the figures of the last runs and their ratios to the ones before."""
 
 from __future__ import annotations
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FOLDER = Path(__file__).parent / "results"
+LAST = Path(__file__).parent / "last.json"  # what the page is made of
+PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 
 
 def seconds(function: Callable[[], Any]) -> float:
@@ -84,6 +87,61 @@ def _lines(path: str) -> list[str]:
     return Path(path).read_text().splitlines() if Path(path).exists() else []
 
 
+def keep(names: list[str], arguments: str) -> Path:
+    """Put the bars of these benchmarks, run just now, in the place of their last figures, and write the page."""
+    last = json.loads(LAST.read_text()) if LAST.exists() else {}
+    for name in names:
+        path = FOLDER / f"{name}.json"
+        if not path.exists():
+            continue
+        found = json.loads(path.read_text())
+        before = {bar["claim"]: bar["measured"] for bar in last.get(name, {}).get("bars", [])}
+        for bar in found["bars"]:
+            earlier = before.get(bar["claim"])
+            bar["ratio"] = bar["measured"] / earlier if earlier else None
+        last[name] = {"arguments": arguments, "before": last.get(name, {}).get("machine", {}).get("date"),
+                      **{key: found[key] for key in ("machine", "seconds", "bars")}}  # fmt: skip
+    LAST.write_text(json.dumps(last, indent=1, sort_keys=True) + "\n")
+    PAGE.write_text(_page(last))
+    return PAGE
+
+
+def _page(last: dict[str, Any]) -> str:
+    lines = [
+        "# Figures of the last benchmark runs",
+        "",
+        "Written by `python -m benchmarks NAME ... --page` from a checkout, one section a benchmark; what each "
+        "measures is in the first lines of its file in `benchmarks/`. *Ratio*: to the run before, where there was one. "
+        "Times are those of the machine that is named, on which others work as well: compare ratios, not seconds. A "
+        "miss is a bar that the code does not reach.",
+        "",
+    ]
+    for name, run in sorted(last.items()):
+        of = run["machine"]
+        versions = ", ".join(f"{key} {of[key]}" for key in ("polinfer", "numpy", "scipy", "jax"))
+        lines += [
+            f"## {name}",
+            "",
+            f"`python -m benchmarks {name}{run['arguments']}`: {of['date']}, {of['processor']}, {of['cores']} cores, "
+            f"Python {of['python']}, {versions}; {run['seconds']:.0f} s"
+            + (f"; ratios to {run['before']}." if run["before"] else "."),
+            "",
+        ]
+        if not run["bars"]:
+            lines += ["No bars: it prints tables.", ""]
+            continue
+        lines += ["| claim | measured | bar | | ratio |", "|---|---|---|---|---|"]
+        for bar in run["bars"]:
+            held = bar["measured"] >= bar["bar"] if bar["at_least"] else bar["measured"] <= bar["bar"]
+            ratio = f"{bar['ratio']:.2f}" if bar.get("ratio") is not None else ""
+            claim = bar["claim"].replace("|", "\\|")
+            sign = "≥" if bar["at_least"] else "≤"
+            lines.append(f"| {claim} | {bar['measured']:.4g} {bar['unit']} | {sign} {bar['bar']:g} | "
+                         f"{'holds' if held else 'MISS'} | {ratio} |")  # fmt: skip
+        lines.append("")
+    return "\n".join(lines)
+
+
 @dataclass
 class Results:
     """Rows and bars of one benchmark."""
@@ -93,6 +151,7 @@ class Results:
     bars: list[dict[str, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self.began = time.perf_counter()
         print(f"\n== {self.name}: " + ", ".join(f"{k} {v}" for k, v in machine().items()))
 
     def add(self, **row: Any) -> None:
@@ -117,7 +176,9 @@ class Results:
         """Write JSON, and the picture if there is one."""
         FOLDER.mkdir(exist_ok=True)
         path = FOLDER / f"{self.name}.json"
-        path.write_text(json.dumps({"machine": machine(), "bars": self.bars, "rows": self.rows}, indent=1))
+        spent = time.perf_counter() - self.began
+        found = {"machine": machine(), "seconds": spent, "bars": self.bars, "rows": self.rows}
+        path.write_text(json.dumps(found, indent=1))
         if figure is not None:
             figure.savefig(path.with_suffix(".png"), dpi=120)
         print(f"wrote {path}" + (f" and {path.with_suffix('.png').name}" if figure is not None else ""))
