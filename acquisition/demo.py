@@ -213,6 +213,8 @@ def _errors(
     def off(retrieved: list[np.ndarray], true: list[np.ndarray]) -> str:
         pairs = scipy.spatial.cKDTree(calibration.fibrelets.centres).query_pairs(6e-6, output_type="ndarray")
         pairs = pairs[found[pairs].all(1)]
+        if len(pairs) == 0:
+            return ""
         first, second = pairs.T
         a, b = (np.stack([f[:, first] * f[:, second].conj() for f in fields]) for fields in (retrieved, true))
         return f"{np.linalg.norm(a - b) / np.linalg.norm(b):.3f}"

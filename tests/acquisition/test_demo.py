@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 import fibre
 from acquisition import demo
-from acquisition.demo import report, run_demo
+from acquisition.demo import full_setup, report, run_demo, stages
 from acquisition.run import Folder
 from polinfer import Parameters
 from polinfer.cli import main
@@ -66,6 +66,37 @@ def test_the_report_names_every_parameter_and_the_chi_square(result):
     for name in Parameters._fields:
         assert name in text
     assert f"{result.chi_square[0] / result.chi_square[1]:.2f}" in text
+
+
+def test_every_stage_is_near_the_truth_and_stands_beside_the_published_figure(result):
+    lines = []
+    stages(result, lines.append)
+    text = "\n".join(lines)
+    for name in result.seconds:
+        assert name in text
+    for published in ("50.8 min", "67 s a field", "9.5 h", "24 min"):
+        assert published in text
+    assert 0 < float(result.errors["fields of the calibration"]) < 0.05
+    assert 0 < float(result.errors["fields of the sample"]) < 0.05
+    assert 0 < float(result.errors["inverse matrix"]) < 0.15
+
+
+def test_the_full_size_is_the_published_one():
+    full = full_setup(0)
+    assert full.scene.camera.shape == (1200, 1200)
+    assert np.prod(full.calibration.grid) == 972
+    assert len(full.sample.views) * 3 == 33
+    assert 8500 < full.scene.bundle.cores < 9500
+
+
+@pytest.mark.slow
+def test_the_setup_of_the_full_size_runs_small(tmp_path):
+    small = run_demo(tmp_path, 0, setup=full_setup(0, (6, 6), 240))
+    chi_square, freedom, pixels = small.chi_square
+    assert pixels == 36
+    assert 0.1 < chi_square / freedom < 2
+    assert float(small.errors["fields of the sample"]) < 0.06
+    assert float(small.errors["inverse matrix"]) < 0.2
 
 
 def test_the_bench_of_the_demo_is_not_what_the_recovery_believes():
