@@ -33,8 +33,8 @@ def second_polarisation(
 
     .. math:: \min_v \sum_x \frac{|p(x) - H^*(x) (G v)(x)|^2}{\mathrm{var}\,p(x)} + |v|^2 / P
 
-    with p the measured conj(H) V (:func:`fibre.relative_phase`), H = G h that of the modes found, and P all power of H:
-    where there is no light the amplitude is 0 with variance P.
+    with p the measured conj(H) V (:func:`fibre.relative_phase`), H = G h that of the modes found, and P all power of H,
+    or of its noise: where there is no light the amplitude is 0 with variance P.
 
     ``h`` (m,) and its variance; ``fringes`` and ``noise``, their variances, infinite where unusable: (k, y, x) on the
     camera's pixels; ``steps`` (k,) radians.
@@ -47,8 +47,9 @@ def second_polarisation(
     weight = np.where(usable, 1 / np.where(usable, found.variance, 1), 0).astype(np.float32)
     strength = (weight * (field.real**2 + field.imag**2)).ravel()
     right = (weight * field * np.where(usable, found.product, 0)).astype(np.complex64).ravel()
-    power = float((np.abs(h) ** 2).sum())
-    ridge = np.float32(1 / max(power, 1e-30))
+    # of a dark H at least what its noise would be
+    power = max(float((np.abs(h) ** 2).sum()), len(h) * h_variance)
+    ridge = np.float32(1 / power)
     diagonal = views.squares @ strength + ridge
     scale = 1 / np.sqrt(diagonal)
 

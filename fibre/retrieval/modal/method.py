@@ -129,7 +129,7 @@ class Modal(ModeMethod):
                 found = self._found(stack, 0, geometry, coarse, spread)
                 floor, misfitted = _judged(found, coarse, spread)
                 # a coarse pixel is the mean of step^2 of the camera's, and modes are of unit power over those
-                floor = min(floor * geometry.views.step**2, float((np.abs(found.amplitudes) ** 2).sum()) + 1e-300)
+                floor *= geometry.views.step**2
                 second, variance = second_polarisation(
                     geometry.views, found.amplitudes, floor, radiance[planes:], noise[planes:], images.steps
                 )
@@ -155,7 +155,8 @@ class Modal(ModeMethod):
         """
         ones = np.ones(len(images))
         if not np.any(stack.intensities[k] > 0):
-            return Found(np.zeros(len(self.fibrelets.centres), complex), 0.0, ones, 0.0, 0.0)
+            dark = np.zeros(len(self.fibrelets.centres), complex)
+            return Found(dark, 0.0, ones, 0.0, 0.0, powers=np.zeros_like(images))
         weights = np.where(np.isfinite(spread), 1 / spread, 0).astype(np.float32)
         turn = None
         if self.focus_spread > 0:
@@ -234,8 +235,7 @@ def _made(key: _Key) -> Geometry:
 def _judged(found: Found, images: np.ndarray, spread: np.ndarray) -> tuple[float, bool]:
     """As :func:`fibre.retrieval.base.judged`, of images on the coarse grid (image, y, x) and what was found of them:
     variance of the field from the noise of the images, and whether field and images differ by more."""
-    if found.powers is None:
-        return np.inf, False
+    assert found.powers is not None
     total = left = light = 0.0
     count = 0
     for image, variance, power, gain in zip(images, spread, found.powers, found.gains, strict=True):
@@ -244,7 +244,9 @@ def _judged(found: Found, images: np.ndarray, spread: np.ndarray) -> tuple[float
         left += float(np.vdot(weight, (np.sqrt(power) - amplitude) ** 2))
         light += float(np.vdot(weight, amplitude**2))
         count += usable
-    expected = count / max(total, 1e-300)
+    if not total > 0:
+        return float(max(np.abs(images).sum(), 1.0)), True  # no pixel says anything: all light that there could be
+    expected = count / total
     return 2 * expected / len(images), left > 2 * count + 0.01 * light
 
 
