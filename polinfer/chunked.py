@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from . import storage
 from .checks import integer, one_of_types
@@ -199,6 +198,8 @@ def fit_stored(
     >>> bool(np.allclose(polinfer.load(path).parameters.retardance, together.parameters.retardance))
     True
     """
+    from tqdm import tqdm
+
     one_of_types("model", model, (Model,), "pass Model(...).")
     if isinstance(model.misalignment, TiltPlane):
         raise ValueError(
