@@ -8,6 +8,7 @@ import threading
 import time
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 import zarr
@@ -135,8 +136,13 @@ def test_an_interrupted_fit_goes_on(tmp_path, monkeypatch):
         fit_stored(Model(), source, tmp_path / "other.zarr", 20)
 
 
-def test_workers_fit_blocks_and_may_be_killed(tmp_path):
+def test_workers_fit_blocks_and_may_be_killed(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="dask is not installed (pip install 'polinfer[cluster]')")
+    # what this process has compiled, workers need not compile
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     measurement = data((40, 30))
     source, target = save(measurement, tmp_path / "data.zarr"), tmp_path / "fit.zarr"
     killed, progress = [], tmp_path / ".fit.zarr.json"
