@@ -147,15 +147,13 @@ def _preview(bench: Any, plan: Any, path: Path) -> None:
     """The first view of the first step that is no reference, at the longest exposure that does not saturate."""
     from matplotlib.figure import Figure
 
+    from acquisition.contracts import bracketed
     from acquisition.plan import GridPlan
 
     step = next(step for step in plan.captures if step.kind != "reference")
     points = plan.points if isinstance(plan, GridPlan) else None
     bench.prepare(step, plan.views, plan.illumination, points)
-    for exposure in plan.views.bracket.times():
-        frame = bench.expose(0, exposure)
-        if frame.counts.max() < bench.full_scale:
-            break
+    frame = bracketed(bench, 0, plan.views.bracket)[-1]
     figure = Figure(figsize=(6, 5), layout="constrained")
     axes = figure.subplots()
     shown = axes.imshow(frame.counts, cmap="gray", vmin=0, vmax=bench.full_scale, interpolation="nearest")

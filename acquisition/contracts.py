@@ -14,11 +14,21 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 
 from acquisition.errors import AcquisitionError, SettingError
-from acquisition.exposure import MergeRule
+from acquisition.exposure import Bracket, MergeRule
 from acquisition.plan import Step, Views
 from acquisition.settings import Setting, Written
 
-__all__ = ["AnyBench", "Camera", "Device", "Frame", "Instrument", "PhaseModulator", "Shown", "leave_safely"]
+__all__ = [
+    "AnyBench",
+    "Camera",
+    "Device",
+    "Frame",
+    "Instrument",
+    "PhaseModulator",
+    "Shown",
+    "bracketed",
+    "leave_safely",
+]
 
 
 def leave_safely(make_safe: Callable[[], None], error: BaseException | None) -> None:
@@ -214,3 +224,14 @@ class AnyBench(Protocol):
 
     def make_safe(self) -> None:
         """Light to safe values. Called on every way out of a run; calling it twice does nothing more."""
+
+
+def bracketed(bench: AnyBench, view: int, bracket: Bracket) -> list[Frame]:
+    """Frames of a view of the step that ``bench`` was prepared for: from the longest exposure of the bracket to the
+    first that does not saturate."""
+    frames: list[Frame] = []
+    for exposure in bracket.times():
+        frames.append(bench.expose(view, exposure))
+        if frames[-1].counts.max() < bench.full_scale:
+            break
+    return frames

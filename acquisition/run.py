@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from acquisition.contracts import AnyBench, Frame, leave_safely
+from acquisition.contracts import AnyBench, bracketed, leave_safely
 from acquisition.errors import DeviceLost, DeviceTimeout, FrameLost
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
 from acquisition.recording import Folder, MergedStack
@@ -158,13 +158,7 @@ def _take(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, st
     """One capture: all exposures of all its views, then on the disk."""
     bench.prepare(step, plan.views, plan.illumination, points)
     started = bench.time()
-    images: list[list[Frame]] = []
-    for view in range(len(plan.views)):
-        images.append([])
-        for exposure in plan.views.bracket.times():
-            images[-1].append(bench.expose(view, exposure))
-            if images[-1][-1].counts.max() < bench.full_scale:
-                break
+    images = [bracketed(bench, view, plan.views.bracket) for view in range(len(plan.views))]
     store.store(
         step.id,
         [np.stack([frame.counts for frame in image]) for image in images],

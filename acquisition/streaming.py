@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from acquisition.contracts import AnyBench
+from acquisition.contracts import AnyBench, bracketed
 from acquisition.plan import SamplePlan, Step
 from fibre import Images, Inverse, Recording, RecordingFields, reconstruct, retrieve_fields, retrieve_sample
 from fibre.retrieval.base import RetrievalMethod
@@ -81,11 +81,7 @@ class FibreImager:
             times.append(self.bench.time())
             images = []
             for view in range(len(views)):
-                frames = []
-                for exposure in views.bracket.times():
-                    frames.append(self.bench.expose(view, exposure))
-                    if frames[-1].counts.max() < self.bench.full_scale:
-                        break
+                frames = bracketed(self.bench, view, views.bracket)
                 counts = np.stack([frame.counts for frame in frames])
                 taken = [frame.exposure for frame in frames]
                 images.append(merge_exposures(counts, taken, self.bench.full_scale, self.bench.merge_rule))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from acquisition import GridPlan, SimulatedBench, Step, merge_exposures
+from acquisition.contracts import bracketed
 from fibre import Calibration, Images
 
 
@@ -33,13 +34,9 @@ class _Live:
             bench.prepare(step, self.plan.views, self.plan.illumination, self.plan.points)
             merged = []
             for view in range(len(self.plan.views)):
-                frames, times = [], []
-                for exposure in self.plan.views.bracket.times():
-                    frames.append(bench.expose(view, exposure).counts)
-                    times.append(exposure)
-                    if frames[-1].max() < bench.full_scale:
-                        break
-                merged.append(merge_exposures(np.stack(frames), times, bench.full_scale, bench.merge_rule))
+                frames = bracketed(bench, view, self.plan.views.bracket)
+                counts, times = np.stack([f.counts for f in frames]), [f.exposure for f in frames]
+                merged.append(merge_exposures(counts, times, bench.full_scale, bench.merge_rule))
             self.cache.clear()
             self.cache[step.id] = {
                 name: np.stack([getattr(m, name) for m in merged]).astype(bool if name == "saturated" else np.float32)

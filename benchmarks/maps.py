@@ -22,7 +22,9 @@ import scipy.fft
 import scipy.sparse
 
 import polinfer
-from acquisition import Bracket, CalibrationPlan, CameraModel, SamplePlan, Scene, SimulatedBench, Views, merge_exposures
+from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, Step, merge_exposures
+from acquisition.contracts import bracketed
+from acquisition.demo import FULL_GRID, FULL_SIDE, full_setup
 from benchmarks.results import Results
 from fibre import (
     Bundle,
@@ -39,13 +41,10 @@ from fibre import (
     retrieve_fields,
     retrieve_sample,
 )
-from polinfer import ComplexGain, Gibbs, Measurement, Model, RetarderFirst, phantoms
+from polinfer import ComplexGain, Gibbs, Measurement, Model, RetarderFirst
 from polinfer.validation import jones_chi_square
 
-GRID, STRIDE, PITCH = (27, 36), 9, 68.2e-6 / 9
-SIDE, PIXEL, MARGIN = 1200, 0.39e-6, 10e-6
-WAIST, NOISE = 2.5e-6, 0.02
-VIEWS = Views(tuple(np.linspace(-25e-6, 25e-6, 7).tolist()), bracket=Bracket(64e-3, 4.0, 1e-3))
+STRIDE, WAIST, NOISE = 9, 2.5e-6, 0.02
 SAMPLER = Gibbs(effective=1000, evidence=False)
 STAGES = ("merge", "fields", "jones", "fit", "posterior")
 PAPER = {"fields": 3 * 67.0, "fit": 24 * 60.0}  # seconds, on its hardware of 2018
@@ -88,13 +87,8 @@ def exposed(bench: SimulatedBench, plan: SamplePlan, kind: str) -> list[list[tup
         bench.prepare(step, plan.views, plan.illumination, None)
         views = []
         for view in range(len(plan.views)):
-            frames, times = [], []
-            for exposure in plan.views.bracket.times():
-                frames.append(bench.expose(view, exposure).counts)
-                times.append(exposure)
-                if frames[-1].max() < bench.full_scale:
-                    break
-            views.append((np.stack(frames), times))
+            frames = bracketed(bench, view, plan.views.bracket)
+            views.append((np.stack([f.counts for f in frames]), [f.exposure for f in frames]))
         captures.append(views)
     return captures
 
@@ -113,24 +107,19 @@ def merged(bench: SimulatedBench, plan: SamplePlan, raw: list[list[tuple[np.ndar
                   bench.wavelength, bench.pixel_size)  # fmt: skip
 
 
-def sample(seed: int = 0, side: int = SIDE, grid: tuple[int, int] = GRID) -> Sample:
+def sample(seed: int = 0, side: int = FULL_SIDE, grid: tuple[int, int] = FULL_GRID) -> Sample:
     """One sample and all that was there before it."""
-    radius = side * PIXEL / 2 - MARGIN
-    bundle = Bundle.hexagonal(radius=radius, rng=seed)
-    plan = SamplePlan(views=VIEWS)
-    scene = Scene(
-        bundle, phantoms.lesion(grid, rng=seed), CameraModel((side, side), PIXEL), PITCH,
-        illumination_waist=2e-4, reference=(0.0, radius - 5e-6), focus_error=3e-3, step_error=5e-3,
-        sample_oversampling=2,
-    )  # fmt: skip
+    setup = full_setup(seed, grid, side)
+    scene, plan, bundle = setup.scene, setup.sample, setup.scene.bundle
     bench = SimulatedBench(scene, rng=seed)
     blank, frames, references = (exposed(bench, plan, kind) for kind in ("blank", "sample", "reference"))
     fibrelets = Fibrelets(bundle.centres, bundle.mode_radius)
     recording = Recording(merged(bench, plan, frames), plan.illumination, merged(bench, plan, blank),
                           merged(bench, plan, references))  # fmt: skip
     before = retrieve_fields(recording, Modal(fibrelets), fibrelets, progress=True)
-    spot = bundle.transmit(np.stack([bundle.launch(np.array([scene.reference]), WAIST).toarray()[:, 0]] * 2) / 2**0.5)
-    calibration = calibrated(bundle, CalibrationPlan(grid, pitch=PITCH, stride=STRIDE), spot, scene.spot_power, seed)
+    spot = bench.amplitudes(Step("reference-0", "reference"), plan.illumination, None)
+    design = CalibrationPlan(grid, pitch=scene.pitch, stride=STRIDE)
+    calibration = calibrated(bundle, design, spot, scene.spot_power, seed)
     inverse = recover(calibration, ForwardInverse(), progress=True)
     gain = np.asarray(scene.phantom.gain)[..., None, None]
     jones = np.asarray(RetarderFirst().jones(scene.phantom.parameters)) * gain
@@ -140,8 +129,8 @@ def sample(seed: int = 0, side: int = SIDE, grid: tuple[int, int] = GRID) -> Sam
 def main(size: int | None = None, full: bool = False) -> None:
     """Print the table; ``size``: pixels along a side of the frame instead of 1200, with fewer points."""
     results = Results("maps")
-    side = size or SIDE
-    points = GRID if size is None else (9, 9)
+    side = size or FULL_SIDE
+    points = FULL_GRID if size is None else (9, 9)
     made = sample(0, side, points)
     calibration, model = made.inverse.calibration, Model(gain=ComplexGain(1.0))
     frame = np.random.default_rng(0).standard_normal((side, side)).astype(np.complex64)
