@@ -6,12 +6,17 @@ written for JAX, so they can be differentiated and compiled.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 __all__ = ["multiply", "polariser", "retarder"]
+
+# called by themselves they are one piece of code for a shape, not one for each of twenty operations; called in code
+# that is compiled they leave no trace
+COMPILED = partial(jax.jit, inline=True)
 
 
 def _root(x: jax.Array) -> jax.Array:
@@ -24,6 +29,7 @@ def _matrix(a: jax.Array, b: jax.Array, c: jax.Array, d: jax.Array) -> jax.Array
     return jnp.stack([jnp.stack([a, b], axis=-1), jnp.stack([c, d], axis=-1)], axis=-2)
 
 
+@COMPILED
 def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
     """Product of 2 x 2 matrices in the last two axes, ``(..., 2, 2)``.
 
@@ -34,6 +40,7 @@ def multiply(left: jax.Array, right: jax.Array) -> jax.Array:
     return (left[..., :, :, None] * right[..., None, :, :]).sum(axis=-2)
 
 
+@COMPILED
 def polariser(diattenuation: Any, diattenuation_angle: Any) -> jax.Array:
     """Jones matrix ``(..., 2, 2)`` of a partial polariser, real and symmetric.
 
@@ -59,6 +66,7 @@ def polariser(diattenuation: Any, diattenuation_angle: Any) -> jax.Array:
     return _matrix(mean + cosine, -sine, -sine, mean - cosine)
 
 
+@COMPILED
 def retarder(retardance: Any, retardance_angle: Any, circularity: Any) -> jax.Array:
     """Jones matrix ``(..., 2, 2)`` of an elliptical retarder, unitary with determinant 1.
 

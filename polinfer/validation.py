@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .checks import complex_array, one_of_types
+from .orderings import Ordering
 from .records import Fit, Parameters
 
 __all__ = ["jones_chi_square"]
@@ -58,13 +60,8 @@ def jones_chi_square(fit: Fit, jones: Any) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([np.broadcast_to(np.asarray(x, float), shape).ravel() for x in complete], axis=-1)
     known = np.isfinite(points).all(-1)
 
-    def elements(vector: jax.Array) -> jax.Array:
-        flat = model.ordering.jones(Parameters(*vector)).ravel()
-        return jnp.concatenate([flat.real, flat.imag])
-
     safe = jnp.asarray(np.where(known[:, None], points, 0.1))
-    slope = np.asarray(jax.vmap(jax.jacfwd(elements))(safe), float)
-    fitted = np.asarray(jax.vmap(elements)(safe), float)
+    fitted, slope = (np.asarray(x, float) for x in _elements(model.ordering, safe))
     true = truth.reshape(-1, 4).astype(complex)
     if model.known_gain.free_phase:
         matrix = fitted[:, :4] + 1j * fitted[:, 4:]
@@ -91,3 +88,14 @@ def jones_chi_square(fit: Fit, jones: Any) -> tuple[np.ndarray, np.ndarray]:
     chi_square = np.where(claimed, along / np.where(claimed, values, 1), 0).sum(-1)
     freedom = np.where(known, claimed.sum(-1), 0)
     return np.where(known, chi_square, np.nan).reshape(shape), freedom.reshape(shape)
+
+
+@partial(jax.jit, static_argnums=0)
+def _elements(ordering: Ordering, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Real and imaginary parts of J ``(pixels, 8)`` and their derivatives by the parameters ``(pixels, 8, 5)``."""
+
+    def elements(vector: jax.Array) -> jax.Array:
+        flat = ordering.jones(Parameters(*vector)).ravel()
+        return jnp.concatenate([flat.real, flat.imag])
+
+    return jax.vmap(elements)(points), jax.vmap(jax.jacfwd(elements))(points)

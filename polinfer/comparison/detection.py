@@ -21,6 +21,7 @@ from .units import units_of
 __all__ = ["Power", "power"]
 
 PIXELS = 1 << 17  # in memory at once
+FEW = 1 << 12  # frames up to this size share compiled code, which takes longer to make than a short study to run
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,8 @@ def power(
     generator, seed = as_generator(rng)
     # one sigma for a frame: every scene is a frame of its own
     by_frame = any(isinstance(m.noise, InferredNoise) and not m.noise.integrated for m in (model_a, model_b))
-    block = 1 if by_frame else max(1, PIXELS // pixels)
+    together = PIXELS if simulations * pixels > PIXELS else FEW
+    block = 1 if by_frame else max(1, together // pixels)
     choices, advantages = [], []
     for begin in range(0, simulations, block):
         size = (min(block, simulations - begin), pixels)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ...records import Parameters
-from ...statistics import Statistics
+from ...statistics import Statistics, project
 from ...threads import each, piece
 from . import kernel
 from .climb import moved
@@ -70,6 +70,24 @@ class Responses:
         seen = np.where(weight > 0, self.response[index], 0) * weight
         return self.shared.root / sigma, seen @ self.shared.rows.conj().T / sigma
 
+    @property
+    def small(self) -> bool:
+        """Whether code for statistics, compiled once for any number of states, is worth more than one pass less."""
+        return not _large(self.pixels)
+
+    def summed(self) -> Summed:
+        """The same pixels by their statistics."""
+        shared, sigma = self.shared, np.broadcast_to(self.sigma, self.pixels).astype(float)
+        used = shared.root_weight > 0
+        response, rest = project(np.where(used, self.response, 0) * shared.root_weight, shared.rows)
+        rest = rest / sigma**2
+        constant = shared.log_weight - shared.count * np.log(pi * sigma**2) - rest
+        wide, count = sigma[:, None, None], np.full(self.pixels, shared.count)
+        values = Statistics(shared.root / wide, response / wide, rest, constant, count)
+        complex_type = np.result_type(self.dtype, np.complex64)
+        cast = (x.astype(complex_type if np.iscomplexobj(x) else self.dtype, copy=False) for x in values)
+        return Summed(Statistics(*cast), self.balanced)
+
 
 @dataclass(frozen=True)
 class Summed:
@@ -111,6 +129,11 @@ def pairs_of(parameters: Parameters, dtype: np.dtype) -> np.ndarray:
     return np.stack(found).astype(dtype)
 
 
+def _large(pixels: int) -> bool:
+    """Whether a frame is cut into large pieces."""
+    return pixels > piece(BLOCKS[1], ACCELERATOR[0])
+
+
 def _fill(index: np.ndarray, size: int) -> np.ndarray:
     """As many indices as code is compiled for."""
     return np.concatenate([index, np.full(size - len(index), index[0])])
@@ -122,7 +145,7 @@ def _pass(
 ) -> None:  # fmt: skip
     """Rows and flags of the pixels ``index`` (None: all), from a start or the closed form, into ``out``."""
     count = frame.pixels if index is None else len(index)
-    large = frame.pixels > piece(BLOCKS[1], ACCELERATOR[0])
+    large = _large(frame.pixels)
     size = piece(BLOCKS[large], ACCELERATOR[large])  # one for all passes: to compile takes seconds
     nothing = kernel.no_start(size, frame.dtype)
 

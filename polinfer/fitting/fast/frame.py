@@ -269,7 +269,7 @@ def fit_responses(
     if earlier is not None:
         known_start = Parameters(*(np.asarray(x) if good is None else np.asarray(x)[good] for x in earlier))
     with bar(frame.pixels, progress) as done:
-        solved = solve(known, frame, known_start, done)
+        solved = solve(known, frame.summed() if frame.small else frame, known_start, done)
     rows, status = solved.rows, status_of(model, solved)
     degrees = max(2 * int(frame.shared.count) - len(model.free) - model.known_gain.real_parameters, 0)
     if degrees:
