@@ -32,7 +32,7 @@ from polinfer import phantoms
 VIEWS = Views(diversity=(-5e-5, -2.5e-5, 0.0, 2.5e-5, 5e-5), bracket=Bracket(64e-3, 4.0, 1e-3))
 PLAN = CalibrationPlan((4, 4), pitch=6e-6, stride=2, reference_every=6, views=VIEWS)
 SAMPLE = SamplePlan(views=VIEWS, references=1)
-METHOD = GerchbergSaxton()
+METHOD = GerchbergSaxton(iterations=50)
 
 
 @dataclass(frozen=True)
