@@ -14,8 +14,9 @@ jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != 
 # The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way.
 BLAS = threadpool_limits(1, user_api="blas")
 # Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
-# otherwise, and the processes of a run share what they compile.
-jax.config.update("jax_disable_most_optimizations", os.environ.get("POLINFER_TEST_OPTIMISED", "0") == "0")
+# otherwise, but for tests that compute longer than they compile; the processes of a run share what they compile.
+OPTIMISED = os.environ.get("POLINFER_TEST_OPTIMISED", "0") != "0"
+COMPUTES = ("fibre", "test_streaming.py", "test_demo.py")  # folders and files
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -25,3 +26,8 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 settings.register_profile("quick", deadline=None, max_examples=150)
 settings.register_profile("fuzz", deadline=None, max_examples=9000)
 settings.load_profile(os.environ.get("POLINFER_FUZZ", "quick"))
+
+
+def pytest_runtest_setup(item):
+    plain = not OPTIMISED and not {item.path.name, item.path.parent.name} & set(COMPUTES)
+    jax.config.update("jax_disable_most_optimizations", plain)

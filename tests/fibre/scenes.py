@@ -70,10 +70,10 @@ class Scene:
         return np.array([oracle.jones(point) for point in np.stack(values, 1)])
 
 
-def scene(grid=(8, 8), stride=4, states=3, radius=25e-6, reference=(0.0, 22e-6)):
+def scene(grid=(8, 8), stride=4, states=3, radius=25e-6, reference=(0.0, 22e-6), pitch=4.2e-6):
     """The standard scene: 109 fibrelets, 64 points."""
     bundle = Bundle.hexagonal(radius=radius, rng=0)
-    plan = CalibrationPlan(grid, stride=stride, states=states)
+    plan = CalibrationPlan(grid, pitch, stride=stride, states=states)
     launch = bundle.launch(plan.points, WAIST)
     matrix = (bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray()
     spot = bundle.launch(np.array([reference]), WAIST).toarray()[:, 0]
