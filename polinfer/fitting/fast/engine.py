@@ -78,15 +78,15 @@ class Responses:
     def summed(self) -> Summed:
         """The same pixels by their statistics."""
         shared, sigma = self.shared, np.broadcast_to(self.sigma, self.pixels).astype(float)
-        used = shared.root_weight > 0
-        response, rest = project(np.where(used, self.response, 0) * shared.root_weight, shared.rows)
-        rest = rest / sigma**2
-        constant = shared.log_weight - shared.count * np.log(pi * sigma**2) - rest
-        wide, count = sigma[:, None, None], np.full(self.pixels, shared.count)
-        values = Statistics(shared.root / wide, response / wide, rest, constant, count)
+        used, wide, count = shared.root_weight > 0, sigma[:, None, None], np.full(self.pixels, shared.count)
         complex_type = np.result_type(self.dtype, np.complex64)
-        cast = (x.astype(complex_type if np.iscomplexobj(x) else self.dtype, copy=False) for x in values)
-        return Summed(Statistics(*cast), self.balanced)
+        with np.errstate(invalid="ignore", over="ignore"):  # pixels that are not finite get no answer
+            response, rest = project(np.where(used, self.response, 0) * shared.root_weight, shared.rows)
+            rest = rest / sigma**2
+            constant = shared.log_weight - shared.count * np.log(pi * sigma**2) - rest
+            values = Statistics(shared.root / wide, response / wide, rest, constant, count)
+            cast = (x.astype(complex_type if np.iscomplexobj(x) else self.dtype, copy=False) for x in values)
+            return Summed(Statistics(*cast), self.balanced)
 
 
 @dataclass(frozen=True)
