@@ -7,6 +7,7 @@ run's raw frames are read.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -16,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from polinfer.checks import integer, one_of_types, real_array, real_number
+from polinfer.threads import each
 
-__all__ = ["Bracket", "InverseVariance", "LongestUnsaturated", "MergeRule", "Merged", "merge_exposures"]
+__all__ = ["Bracket", "InverseVariance", "LongestUnsaturated", "MergeRule", "Merged", "merge_exposures", "merge_views"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ class Bracket:
 @dataclass(frozen=True)
 class Merged:
     """radiance: float32 (y, x), photo-electrons per second. variance: its variance, infinite where saturated at every
-    exposure. saturated: bool (y, x), such pixels; their radiance is only a lower bound."""
+    exposure. saturated: bool (y, x), such pixels; their radiance is only a lower bound. Of several views: (view, y, x).
+    """
 
     radiance: np.ndarray
     variance: np.ndarray
@@ -176,9 +179,25 @@ def merge_exposures(frames: Any, exposures: Any, full_scale: int, rule: MergeRul
         raise ValueError(
             f"frames must hold counts from 0 to full_scale {full_scale}, got {frames.min()} to {frames.max()}."
         )
-    longest_first = np.argsort(-times, kind="stable")
-    radiance, variance, saturated = _merged(frames[longest_first], times[longest_first], full_scale, rule)
+    if np.any(np.diff(times) > 0):
+        longest_first = np.argsort(-times, kind="stable")
+        frames, times = frames[longest_first], times[longest_first]
+    radiance, variance, saturated = _merged(frames, times, full_scale, rule)
     return Merged(np.asarray(radiance), np.asarray(variance), np.asarray(saturated))
+
+
+def merge_views(frames: Sequence[Any], exposures: Sequence[Any], full_scale: int, rule: MergeRule) -> Merged:
+    """:func:`merge_exposures` of every view of a capture, on all cores: arrays (view, y, x)."""
+    shape = (len(frames), *np.shape(frames[0])[1:])
+    whole = Merged(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool))
+
+    def one(view: int) -> None:
+        found = merge_exposures(frames[view], exposures[view], full_scale, rule)
+        whole.radiance[view], whole.variance[view] = found.radiance, found.variance
+        whole.saturated[view] = found.saturated
+
+    each(one, range(len(frames)))
+    return whole
 
 
 @partial(jax.jit, static_argnames="rule")

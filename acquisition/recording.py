@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from acquisition.errors import RunMismatch
-from acquisition.exposure import Merged, MergeRule, merge_exposures
+from acquisition.exposure import Merged, MergeRule, merge_views
 
 __all__ = ["Folder", "MergedStack"]
 
@@ -150,7 +150,7 @@ class MergedStack:
     rule: MergeRule
     shape: tuple[int, int, int, int]
     part: str
-    cache: dict[str, list[Merged]]
+    cache: dict[str, Merged]
 
     @property
     def dtype(self) -> np.dtype:
@@ -164,10 +164,11 @@ class MergedStack:
         identity = self.identities[index]
         if identity not in self.cache:
             frames, exposures = self.folder.load(identity)
-            merged = [merge_exposures(f, t, self.full_scale, self.rule) for f, t in zip(frames, exposures, strict=True)]
             self.cache.clear()
-            self.cache[identity] = merged
-        return np.stack([getattr(m, self.part) for m in self.cache[identity]]).astype(self.dtype)
+            self.cache[identity] = merge_views(frames, exposures, self.full_scale, self.rule)
+        part: np.ndarray = getattr(self.cache[identity], self.part).view()
+        part.flags.writeable = False  # it is the cache's own
+        return part
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         if copy is False:

@@ -22,9 +22,10 @@ import scipy.fft
 import scipy.sparse
 
 import polinfer
-from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, Step, merge_exposures
+from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, Step
 from acquisition.contracts import bracketed
 from acquisition.demo import FULL_GRID, FULL_SIDE, full_setup
+from acquisition.exposure import merge_views
 from benchmarks.results import Results
 from fibre import (
     Bundle,
@@ -100,9 +101,9 @@ def merged(bench: SimulatedBench, plan: SamplePlan, raw: list[list[tuple[np.ndar
     radiance, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
     saturated = np.empty(shape, bool)
     for c, capture in enumerate(raw):
-        for v, (frames, times) in enumerate(capture):
-            found = merge_exposures(frames, times, bench.full_scale, bench.merge_rule)
-            radiance[c, v], variance[c, v], saturated[c, v] = found.radiance, found.variance, found.saturated
+        frames, times = zip(*capture, strict=True)
+        found = merge_views(frames, times, bench.full_scale, bench.merge_rule)
+        radiance[c], variance[c], saturated[c] = found.radiance, found.variance, found.saturated
     return Images(radiance, variance, saturated, np.array(views.diversity), np.array(views.steps), np.zeros(len(raw)),
                   bench.wavelength, bench.pixel_size)  # fmt: skip
 
