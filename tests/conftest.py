@@ -17,6 +17,7 @@ BLAS = threadpool_limits(1, user_api="blas")
 # otherwise, but for tests that compute longer than they compile; the processes of a run share what they compile.
 OPTIMISED = os.environ.get("POLINFER_TEST_OPTIMISED", "0") != "0"
 COMPUTES = ("fibre", "test_streaming.py", "test_demo.py")  # folders and files
+jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

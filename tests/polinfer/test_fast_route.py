@@ -27,6 +27,7 @@ from polinfer import (
     simulate,
 )
 from polinfer.fitting.fast import fast_scene
+from polinfer.fitting.fast.frame import frame_of_responses, solve
 from tests.polinfer.scenes import (
     BALANCED,
     CASES,
@@ -254,3 +255,19 @@ def test_a_window_is_the_joint_fit_of_its_pixels():
 )
 def test_what_is_shipped_goes_the_fast_route_and_what_is_not_the_general_one(model, fast):
     assert (fast_scene(model) is not None) == fast
+
+
+def test_small_frames_by_their_statistics_have_the_answers_of_their_responses():
+    """Of four unbalanced states, one without weight, sigma by pixels: the two sides of the limit of small frames."""
+    rng = np.random.default_rng(7)
+    truth = polinfer.phantoms.lesion((6, 8), rng=1).parameters
+    states = rng.standard_normal((2, 4)) + 1j * rng.standard_normal((2, 4))
+    sigma = rng.uniform(0.01, 0.03, (6, 8))
+    response = simulate(Model(), truth, states, sigma, rng=2).response
+    response[..., 3] = np.nan
+    model, weight = Model(gain=ComplexGain(1.0)), np.array([1.0, 0.5, 2.0, 0.0])
+    frame = frame_of_responses(model, Measurement(states, response, sigma, weight), None)
+    assert frame.small
+    one, other = (solve(fast_scene(model), each).rows for each in (frame, frame.summed()))
+    assert np.isfinite(one).all()
+    np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-9)
