@@ -21,7 +21,7 @@ from fibre.retrieval.base import RetrievalMethod
 from polinfer import Fit, Measurement, Model, fit
 from polinfer.checks import integer, one_of_types, real_number
 
-from .exposure import merge_exposures
+from .exposure import merge_views
 
 __all__ = ["FibreImager", "Imager", "StreamedFrame", "stream"]
 
@@ -79,16 +79,12 @@ class FibreImager:
         for step in steps:
             self.bench.prepare(step, views, plan.illumination, None)
             times.append(self.bench.time())
-            images = []
-            for view in range(len(views)):
-                frames = bracketed(self.bench, view, views.bracket)
-                counts = np.stack([frame.counts for frame in frames])
-                taken = [frame.exposure for frame in frames]
-                images.append(merge_exposures(counts, taken, self.bench.full_scale, self.bench.merge_rule))
-            merged.append(images)
+            images = [bracketed(self.bench, view, views.bracket) for view in range(len(views))]
+            counts = [np.stack([frame.counts for frame in image]) for image in images]
+            taken = [[frame.exposure for frame in image] for image in images]
+            merged.append(merge_views(counts, taken, self.bench.full_scale, self.bench.merge_rule))
         radiance, variance, saturated = (
-            np.stack([np.stack([getattr(m, part) for m in images]) for images in merged])
-            for part in ("radiance", "variance", "saturated")
+            np.stack([getattr(m, part) for m in merged]) for part in ("radiance", "variance", "saturated")
         )
         return Images(radiance, variance, saturated, np.array(views.diversity), np.array(views.steps), np.array(times),
                       self.bench.wavelength, self.bench.pixel_size)  # fmt: skip

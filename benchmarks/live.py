@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from acquisition import GridPlan, SimulatedBench, Step, merge_exposures
+from acquisition import GridPlan, SimulatedBench, Step
 from acquisition.contracts import bracketed
+from acquisition.exposure import merge_views
 from fibre import Calibration, Images
 
 
@@ -32,17 +33,12 @@ class _Live:
         step, bench = self.steps[index], self.bench
         if step.id not in self.cache:
             bench.prepare(step, self.plan.views, self.plan.illumination, self.plan.points)
-            merged = []
-            for view in range(len(self.plan.views)):
-                frames = bracketed(bench, view, self.plan.views.bracket)
-                counts, times = np.stack([f.counts for f in frames]), [f.exposure for f in frames]
-                merged.append(merge_exposures(counts, times, bench.full_scale, bench.merge_rule))
+            images = [bracketed(bench, view, self.plan.views.bracket) for view in range(len(self.plan.views))]
+            counts = [np.stack([frame.counts for frame in image]) for image in images]
+            times = [[frame.exposure for frame in image] for image in images]
             self.cache.clear()
-            self.cache[step.id] = {
-                name: np.stack([getattr(m, name) for m in merged]).astype(bool if name == "saturated" else np.float32)
-                for name in ("radiance", "variance", "saturated")
-            }
-        return self.cache[step.id][self.part]
+            self.cache[step.id] = merge_views(counts, times, bench.full_scale, bench.merge_rule)
+        return getattr(self.cache[step.id], self.part)
 
 
 def calibration(bench: SimulatedBench, plan: GridPlan) -> Calibration:
