@@ -17,11 +17,11 @@ def flat(values: np.ndarray) -> np.ndarray:
     return values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
 
 
-def rows(values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Draws ``(chain, draw, pixel)`` of some pixels in double precision, ``(pixels, chain, draw)``."""
+def rows(values: np.ndarray, pixels: np.ndarray, double: bool = True) -> np.ndarray:
+    """Draws ``(chain, draw, pixel)`` of some pixels, ``(pixels, chain, draw)``, in double or their own precision."""
     first, last = pixels[0], pixels[-1]
     part = values[..., first : last + 1] if last - first + 1 == len(pixels) else values[..., pixels]
-    kind = np.complex128 if values.dtype.kind == "c" else np.float64
+    kind = (np.complex128 if values.dtype.kind == "c" else np.float64) if double else values.dtype
     return np.ascontiguousarray(np.moveaxis(part, -1, 0), dtype=kind)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ from ..threads import each
 from .blocks import blocks, flat, rows
 from .invariants import invariants
 
-__all__ = ["Diagnostics", "diagnose", "effective_sample_size", "split_r_hat"]
+__all__ = ["Diagnostics", "diagnose", "effective_sample_size", "least_effective", "split_r_hat"]
 
 LEAST = 4  # draws of a chain: its halves need a variance
 CONSTANT = 1e-14  # spread over size of values that differ by rounding only
@@ -229,3 +230,35 @@ def diagnose(
     each(judge, range(len(parts)))
     shape = (*status.shape, len(names))
     return Diagnostics(r_hat.reshape(shape), ess.reshape(shape), names)
+
+
+def least_effective(
+    model: Model, parameters: Parameters, gain: np.ndarray | None, sigma: np.ndarray | None,
+    wanted: Mapping[str, np.ndarray],
+) -> np.ndarray:  # fmt: skip
+    """Smallest effective sample size of draws ``(chain, draw, pixel)``, of those functions and pixels only that matter.
+
+    ``wanted``: names of the functions and for each a bool per pixel; infinite where none is wanted. In the draws' own
+    precision.
+
+    >>> rng = np.random.default_rng(1)
+    >>> draws = Parameters(*(0.5 + 0.1 * rng.normal(size=(5, 4, 250, 2))))
+    >>> found = least_effective(Model(), draws, None, None, {"retarder.w": np.array([True, False])})
+    >>> bool(700 < found[0] < 1300), float(found[1])
+    (True, inf)
+    """
+    count, draws = parameters.diattenuation.shape[-1], int(np.prod(parameters.diattenuation.shape[:2]))
+    least = np.full(count, np.inf)
+    parts = list(blocks(np.flatnonzero(np.any(list(wanted.values()), axis=0)), draws))
+
+    def judge(index: int) -> None:
+        part = parts[index]
+        values = Parameters(*(rows(x, part, double=False) for x in parameters))
+        found = _functions(model, values, *(None if x is None else rows(x, part, double=False) for x in (gain, sigma)))
+        for name, needed in wanted.items():
+            some = np.flatnonzero(needed[part])
+            if len(some):
+                least[part[some]] = np.minimum(least[part[some]], _assess(found[name][some])[1])
+
+    each(judge, range(len(parts)))
+    return least

@@ -17,11 +17,12 @@ import numpy as np
 
 from ...fitting.fast.point import Pair, rotate
 
-__all__ = ["angle", "chord", "diattenuation", "half_circle", "quarter_sine", "slice_step", "von_mises"]
+__all__ = ["angle", "chord", "diattenuation", "half_circle", "quarter_sine", "slice_step", "two_harmonics", "von_mises"]
 
 ATTEMPTS = 2  # each succeeds with a probability of 0.66 (high concentration) to 1
 SHRINKS = 6  # of the interval of a slice
 TINY = 1e-30
+NONE = 2.0  # a candidate that stands for: not found
 ROOT_HALF = 0.5**0.5
 SAFE = 0.25  # share of the steps whose candidate has tails as wide as the density
 NEWTON = 2  # steps to the mode of the diattenuation
@@ -89,6 +90,12 @@ def chord(left: Pair, right: Pair) -> Any:
     return 0.5 * (x * x + y * y)
 
 
+def _cauchy(u: Any, p: Any) -> tuple[Any, Any, Any]:
+    """``cos^2``, ``p sin^2`` and ``sin cos`` of ``pi u / 2``."""
+    q, r = quarter_sine(u), quarter_sine(1 - jnp.abs(u))
+    return r * r, p * q * q, q * r
+
+
 def _attempts(random: Any, concentration: Any, mean: Pair) -> tuple[Pair, Any]:
     """Von Mises variates, and where none of the attempts succeeded.
 
@@ -99,18 +106,18 @@ def _attempts(random: Any, concentration: Any, mean: Pair) -> tuple[Pair, Any]:
     k = concentration
     p = 1 / (2 * k + jnp.sqrt(1 + 4 * k * k))
     s, highest = jnp.sqrt(p), 0.5 * (1 - p)
-    found = jnp.zeros(k.shape, bool)
-    cosine, sine = jnp.ones_like(k), jnp.zeros_like(k)
+    chosen: Any = NONE
     for _ in range(ATTEMPTS):
-        u, v = random.signed(), random.uniform()
-        q, r = quarter_sine(u), quarter_sine(1 - jnp.abs(u))
-        a, b = r * r, p * q * q
-        scale = 1 / (a + b)
-        x = b * scale
-        ok = (v * 2 * p * jnp.exp(2 * k * x - highest) <= (p + (1 - p) * x) * (1 + p)) & ~found
-        cosine = jnp.where(ok, (a - b) * scale, cosine)
-        sine = jnp.where(ok, 2 * s * q * r * scale, sine)
-        found = found | ok
+        u, v = random.kept(random.signed()), random.uniform()
+        a, b, _ = _cauchy(u, p)
+        x = b / (a + b)
+        ok = (v * 2 * p * jnp.exp(2 * k * x - highest) <= (p + (1 - p) * x) * (1 + p)) & (chosen == NONE)
+        chosen = jnp.where(ok, u, chosen)
+    chosen = random.kept(chosen)
+    found = chosen != NONE
+    a, b, both = _cauchy(chosen, p)
+    scale = 1 / (a + b)
+    cosine, sine = random.kept(((a - b) * scale, 2 * s * both * scale))
     return (mean[0] * cosine - mean[1] * sine, mean[1] * cosine + mean[0] * sine), found
 
 
@@ -151,14 +158,15 @@ def diattenuation(random: Any, b: Any, c: Any, linear: Any, square: Any, old: Pa
     The log density of ``y = delta / 2`` in [-pi/4, pi/4] is ``b cos y + c sin y + linear D - square D^2 / 2 + log cos
     delta``, the last from ``dD = cos delta d delta``. The candidate is a von Mises variate about the mode.
     """
-    _, (x, y) = direction(b, c)
-    # the search begins at the mean of the von Mises part; near or beyond the edge at the mode of
-    # e exp(-fall e - bent e^2 / 2), e the distance from it
-    fall, bent = (ROOT_HALF * (jnp.abs(c) + sign * b) for sign in (-1, 1))
+    # the search begins at the mean of the von Mises part with the slope of the linear one; near or beyond the edge at
+    # the mode of e exp(-fall e - bent e^2 / 2), e the distance from it
+    _, (x, y) = direction(b, c + 2 * linear)
+    side = jnp.where(y < 0, -1, 1)
+    fall, bent = (ROOT_HALF * (side * c + sign * b) for sign in (-1, 1))
+    bent = bent + 4 * side * linear
     e = 2 / jnp.maximum(fall + jnp.sqrt(fall * fall + 4 * jnp.maximum(bent, 0)), 4)
     near = rotate((jnp.full_like(x, ROOT_HALF), jnp.full_like(x, ROOT_HALF)), -e)
-    far = jnp.abs(y) > 0.6 * x
-    x, y = _choose(far, (near[0], jnp.where(c < 0, -near[1], near[1])), (x, y))
+    x, y = _choose(jnp.abs(y) > 0.6 * x, (near[0], side * near[1]), (x, y))
 
     def bend(x: Any, y: Any, d: Any, k: Any) -> Any:
         """Curvature without that of ``log k``."""
@@ -171,9 +179,12 @@ def diattenuation(random: Any, b: Any, c: Any, linear: Any, square: Any, old: Pa
         step = slope / jnp.maximum(bend(x, y, d, k) + own, own)
         x, y = rotate((x, y), jnp.clip(step, -0.35 * k, 0.35 * k))
     d, k = 2 * x * y, x * x - y * y
-    # an edge adds to the curvature at the mode, but not far from it, where a narrow candidate would hardly ever go
-    edge = jnp.where(random.uniform() > SAFE, 2 / (k * k), 0)
-    concentration = jnp.maximum(jnp.maximum(bend(x, y, d, k), 0) + edge, 1)
+    # an edge and the linear part add to the curvature at the mode, but not far from it, where a narrow candidate would
+    # hardly ever go
+    bent = jnp.maximum(bend(x, y, d, k), 0)
+    wide = bent - jnp.maximum(4 * d * linear, 0)
+    curvature = jnp.where(random.uniform() > SAFE, bent + 2 / (k * k), jnp.maximum(wide, 0.2 * bent))
+    concentration = jnp.maximum(curvature, 1)
     new, found = _attempts(random, concentration, (x, y))
     (d, k), (e, m) = ((2 * p * q, p * p - q * q) for p, q in (new, old))
     inside = (new[0] > 0) & (k > TINY)
@@ -181,6 +192,42 @@ def diattenuation(random: Any, b: Any, c: Any, linear: Any, square: Any, old: Pa
     change = change + (d - e) * (linear - 0.5 * square * (d + e))
     change = change + jnp.log(jnp.where(inside, k, 1) / jnp.maximum(m, TINY))
     return _choose(found & inside & (random.uniform() < jnp.exp(change)), new, old)
+
+
+def two_harmonics(random: Any, first: Pair, second: Pair, old: Pair) -> Pair:
+    """A step that leaves ``exp(b cos y + c sin y + d cos 2y + e sin 2y)`` unchanged; (b, c) and (d, e) are given.
+
+    The candidate is a von Mises variate about the mode, one time in four with tails as wide as the density's, or, one
+    time in four, a wide one about the old angle, which comes out of wherever candidates about the mode seldom go.
+    """
+    (b, c), (d, e) = first, second
+    size, (x, y) = direction(b, c)
+    most = size + 4 * (jnp.abs(d) + jnp.abs(e))
+    for _ in range(NEWTON + 1):
+        x2, y2 = x * x - y * y, 2 * x * y
+        slope = c * x - b * y + 2 * (e * x2 - d * y2)
+        bend = b * x + c * y + 4 * (d * x2 + e * y2)
+        x, y = rotate((x, y), jnp.clip(slope / jnp.maximum(bend, 0.1 * most + TINY), -0.5, 0.5))
+    x2, y2 = x * x - y * y, 2 * x * y
+    # the density about the mode, by the angle from it: a (cos - 1) + t sin + a2 (cos 2 - 1) + t2 sin 2
+    a, t = b * x + c * y, c * x - b * y
+    a2, t2 = d * x2 + e * y2, e * x2 - d * y2
+    concentration = jnp.maximum(a + 4 * a2, 0)
+    kind = random.uniform()
+    walk = kind < SAFE
+    concentration = jnp.where(kind > 1 - SAFE, jnp.clip(a, 0.2 * concentration, concentration), concentration)
+    old_from = (old[0] * x + old[1] * y, old[1] * x - old[0] * y)
+    one, zero = jnp.ones_like(x), jnp.zeros_like(x)
+    new_from, found = _attempts(random, jnp.where(walk, 0.3, 1) * concentration, _choose(walk, old_from, (one, zero)))
+    own = a - jnp.where(walk, 0, concentration)
+
+    def log_ratio(pair: Pair) -> Any:
+        c, s = pair
+        return -own * chord(pair, (one, zero)) + s * (t - 2 * a2 * s + 2 * t2 * c)
+
+    found = found & (random.uniform() < jnp.exp(log_ratio(new_from) - log_ratio(old_from)))
+    new = (new_from[0] * x - new_from[1] * y, new_from[1] * x + new_from[0] * y)
+    return _choose(found, new, old)
 
 
 def slice_step(random: Any, log_density: Callable[[Pair], Any], width: Any, old: Pair) -> Pair:

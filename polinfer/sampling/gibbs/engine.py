@@ -23,7 +23,7 @@ from ...noise import InferredNoise, KnownNoise
 from ...records import Fit, Measurement, Parameters
 from ...statistics import Statistics
 from ...threads import each, piece
-from ..diagnostics import diagnose
+from ..diagnostics import least_effective
 from ..raw import Raw
 from . import kernel
 from .evidence import MOST_DRAWS, Given, log_evidence, unavailable
@@ -207,7 +207,7 @@ class _Chains:
 
 
 def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Largest split R-hat and least effective draws over the invariants, (pixels).
+    """Split R-hat and effective draws of the invariants, (invariants, pixels).
 
     ``sums`` ``(batches, 2, invariants, chains, pixels)`` of batches of ``length`` draws. The effective number comes
     from the variance of the batch means.
@@ -229,15 +229,17 @@ def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         effective = chains * n * (variance + spread) / np.maximum(total, 1e-300)
     r_hat = np.where(still, 1.0, r_hat)
     effective = np.where(still, chains * n, np.minimum(effective, 2 * chains * n))
-    return r_hat.max(axis=0), effective.min(axis=0)
+    return r_hat, effective
 
 
-def _judged(model: Model, store: _Chains, pixels: np.ndarray) -> np.ndarray:
-    """Least effective draws of some pixels by the sum of all autocorrelations: slower than batches, and longer ones."""
+def _judged(problem: Problem, store: _Chains, pixels: np.ndarray, near: dict[str, np.ndarray]) -> np.ndarray:
+    """Least effective draws of some pixels by the sum of all autocorrelations: slower than batches, and longer ones.
+
+    ``near``: the invariants that matter, for each a bool per pixel.
+    """
     gain, precision = (None if x is None else x[..., pixels] for x in (store.gain, store.precision))
     sigma = None if precision is None else precision**-0.5
-    status = np.zeros(len(pixels), np.int32)
-    return diagnose(model, Parameters(*store.parameters[..., pixels]), gain, sigma, status).worst_ess
+    return least_effective(problem.model, Parameters(*store.parameters[..., pixels]), gain, sigma, near)
 
 
 def _run(
@@ -258,7 +260,7 @@ def _run(
         data, reference = jax.tree.map(jnp.asarray, _observed(problem, index)), _reference(problem, index)
         state = _start(problem, index, chains, numbers[index], seed, attempt)
         first = jax.tree.map(lambda x: x[:1], state)._replace(point=_point(problem, index, 1))
-        centre = jnp.stack([jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, first)])
+        centre = jnp.stack([jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, first).values()])
         stream = jax.tree.map(jnp.asarray, stream)
         run = (problem.plan, problem.balanced)
         warm = -(-sampler.warmup // store.length)
@@ -304,8 +306,8 @@ def draw_gibbs(
     """Draws of all pixels of a problem; ``numbers`` are their flat places in the frame, which choose random numbers."""
     known, count = problem.plan, len(numbers)
     store = _Chains(problem, chains, draws, count)
-    invariants = len(kernel.invariants(known, _start(problem, np.zeros(1, int), 1, numbers[:1], seed, 0)))
-    store.sums = np.zeros((store.batches, 2, invariants, chains, count))
+    names = list(kernel.invariants(known, _start(problem, np.zeros(1, int), 1, numbers[:1], seed, 0)))
+    store.sums = np.zeros((store.batches, 2, len(names), chains, count))
     pixels = np.arange(count)
     # few draws cannot reach the number asked for, and their R-hat scatters
     enough, largest = min(sampler.effective, 0.2 * chains * draws), LARGEST_R + 2 / np.sqrt(chains * draws)
@@ -314,9 +316,12 @@ def draw_gibbs(
     r_hat, effective = np.empty(count), np.empty(count)
     for attempt, more in enumerate((1, *MORE)):
         _run(problem, store, pixels, numbers, chains, sampler, sampler.thin * more, seed, attempt, done)
-        r_hat[pixels], effective[pixels] = convergence(store.sums[..., pixels], store.length)
-        near = pixels[effective[pixels] < NEAR * enough]
-        effective[near] = np.minimum(effective[near], _judged(problem.model, store, near))
+        found, number = convergence(store.sums[..., pixels], store.length)
+        near = number < NEAR * enough
+        some = near.any(axis=0)
+        least = _judged(problem, store, pixels[some], dict(zip(names, near[:, some], strict=True)))
+        r_hat[pixels], effective[pixels] = found.max(axis=0), number.min(axis=0)
+        effective[pixels[some]] = np.minimum(effective[pixels[some]], least)
         pixels = pixels[(r_hat[pixels] > largest) | (effective[pixels] < surely)]
         if known.noise == "frame" or len(pixels) == 0:
             break

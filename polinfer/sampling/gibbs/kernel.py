@@ -32,26 +32,31 @@ class Batch(NamedTuple):
     sums: Any
 
 
-def invariants(plan: Plan, state: State) -> list[Any]:
-    """Functions of a state that are the same for all parameter sets of one matrix, those that diagnostics judge by."""
+def invariants(plan: Plan, state: State) -> dict[str, Any]:
+    """Functions of a state that are the same for all parameter sets of one matrix, those that diagnostics judge by.
+
+    The names are those of :class:`polinfer.sampling.Diagnostics`.
+    """
     point = state.point
     (c0, s0), (c1, s1), *_ = point
     d = 2 * s0 * c0
-    found = [jnp.abs(d), d * c1, d * s1] if {0, 1} & set(plan.free) else []
+    found: dict[str, Any] = {}
+    if {0, 1} & set(plan.free):
+        found |= {"polariser.size": jnp.abs(d), "polariser.cos": d * c1, "polariser.sin": d * s1}
     if {2, 3, 4} & set(plan.free):
-        q = retarder_vector(*point[2:])
+        q = dict(zip("wxyz", retarder_vector(*point[2:]), strict=True))
         if plan.bounded:
-            found += q
+            found |= {f"retarder.{i}": x for i, x in q.items()}
         else:  # the other sign of q is the other sign of the gain
-            found += [q[i] * q[j] for i in range(4) for j in range(i, 4) if (i, j) != (3, 3)]
+            found |= {f"retarder.{i}{j}": q[i] * q[j] for i in "wxyz" for j in "wxyz" if i <= j and i + j != "zz"}
     if plan.gain != "unit":
         re, im = state.gain
         square = jnp.maximum(re * re + im * im, 1e-30)
-        found += [(re * re - im * im) / square, 2 * re * im / square]
+        found |= {"gain.cos": (re * re - im * im) / square, "gain.sin": 2 * re * im / square}
         if plan.gain == "complex":
-            found.append(0.5 * jnp.log(square))
+            found["gain.size"] = 0.5 * jnp.log(square)
     if plan.noise != "known":
-        found.append(jnp.log(state.precision))
+        found["sigma"] = jnp.log(state.precision)
     return found
 
 
@@ -106,7 +111,7 @@ def advance(
 
     def one(_: Any, carry: Any) -> Any:
         state, stream = carry
-        random = Random(stream, dtype)
+        random = Random(stream, dtype, data.one)
         state = sweep(plan, balanced, data, state, random)
         return state, random.stream
 
@@ -114,7 +119,7 @@ def advance(
         state, stream, sums = carry
         state, stream = jax.lax.fori_loop(0, thin, one, (state, stream))
         found, shape = invariants(plan, state), state.precision.shape
-        off = jnp.stack([jnp.broadcast_to(x, shape) - c for x, c in zip(found, centre, strict=True)])
+        off = jnp.stack([jnp.broadcast_to(x, shape) - c for x, c in zip(found.values(), centre, strict=True)])
         parameters, sign = _aligned(plan, reference, state.point)
         gain = None if plan.gain == "unit" else jnp.stack([sign * state.gain[0], sign * state.gain[1]])
         precision = None if plan.noise == "known" else state.precision

@@ -131,12 +131,13 @@ def _period(name: str) -> float:
     return 2 * pi if name in ("retardance", "circularity") else pi
 
 
-def conjugate(own: Shape | None) -> tuple[float, float] | None:
-    """What a prior adds to the two coefficients of a von Mises conditional; None: it is none."""
+def conjugate(own: Shape | None) -> tuple[float, float, float, float] | None:
+    """What a prior adds to the coefficients of cos y, sin y, cos 2y and sin 2y; None: it has another form."""
     if own is None or isinstance(own, Flat):
-        return 0.0, 0.0
-    if isinstance(own, Harmonic) and own.order == 1:
-        return own.strength * cos(own.phase), own.strength * sin(own.phase)
+        return 0.0, 0.0, 0.0, 0.0
+    if isinstance(own, Harmonic) and own.order <= 2:
+        pair = own.strength * cos(own.phase), own.strength * sin(own.phase)
+        return (*pair, 0.0, 0.0) if own.order == 1 else (0.0, 0.0, *pair)
     return None
 
 

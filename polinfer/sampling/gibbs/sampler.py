@@ -16,8 +16,9 @@ class Gibbs:
 
     J is multilinear in the unit vectors of five angles, so that for balanced states every conditional distribution is
     von Mises, or has one dimension; successive sweeps are nearly independent (1 to 3 sweeps for one effective draw).
-    Second harmonics of unbalanced states and priors of other forms take slice steps. The equivalent parameter sets are
-    visited by exchanges. It needs a shipped ordering, gain and noise; a window only without gain.
+    Second harmonics of unbalanced states take a candidate about the mode, priors of other forms slice steps. The
+    equivalent parameter sets are visited by exchanges. It needs a shipped ordering, gain and noise; a window only
+    without gain.
 
     Parameters
     ----------

@@ -2,7 +2,8 @@
 
 J is multilinear in the unit vectors of five angles (``fitting.fast.point``), so the log likelihood as a function of one
 of them is ``B cos y + C sin y`` for balanced states: exactly a von Mises density. Unbalanced states add second
-harmonics, priors of other forms add themselves; then a slice step takes the place of the draw.
+harmonics, whose step takes a candidate about the mode; priors of other forms add themselves: then a slice step takes
+the place of the draw.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from ...fitting.fast.likelihoods import square
 from ...fitting.fast.overlap import Pauli, coefficients, imaginary, quadratic_forms, turned
 from ...fitting.fast.point import Pair, Point, dot, matrix, polariser_vector, retarder_vector
 from ...fitting.fast.priors import Harmonic
-from .circle import chord, diattenuation, direction, half_circle, slice_step, von_mises
+from .circle import chord, diattenuation, direction, half_circle, slice_step, two_harmonics, von_mises
 from .plan import Any1D, Plan, conjugate, normal
 from .random import Random
 
@@ -65,10 +66,6 @@ def _value(prior: Any, pair: Pair) -> Any:
     return 0.0 if found is None else found[0]
 
 
-def _kept(one: Any, values: Any) -> Any:
-    return jax.tree.map(lambda x: x / one, values)
-
-
 def sweep(plan: Plan, balanced: bool, data: Observed, state: State, random: Random) -> State:
     """A new state, with the distribution that the old one has if that is the posterior's."""
     point, gain, precision = state
@@ -77,15 +74,15 @@ def sweep(plan: Plan, balanced: bool, data: Observed, state: State, random: Rand
     if plan.noise != "known":
         t = [[precision * x for x in row] for row in t]
     if plan.gain != "unit" or plan.noise != "known":
-        t = _kept(data.one, t)
+        t = random.kept(t)
     weight: Any = 0.0 if balanced else _energy_weight(plan, gain, precision)
-    point = _kept(data.one, _polariser(plan, balanced, data, t, weight, point, random))
+    point = random.kept(_polariser(plan, balanced, data, t, weight, point, random))
     if plan.gain != "unit" and set(plan.free) >= {2, 3, 4}:
-        point, gain = _kept(data.one, _stabiliser(plan, data, precision, point, gain, random))
+        point, gain = random.kept(_stabiliser(plan, data, precision, point, gain, random))
         t = coefficients(plan.retarder_first, turned(data.product, gain))
         if plan.noise != "known":
             t = [[precision * x for x in row] for row in t]
-        t = _kept(data.one, t)
+        t = random.kept(t)
     point = _retarder(plan, balanced, data, t, weight, point, random)
     for copy, behind in plan.exchanges:
         point = _exchange(plan, copy, behind, point, random)
@@ -150,8 +147,12 @@ def _angle(plan: Plan, index: int, b: Any, c: Any, second: tuple[Any, Any] | Non
     """A draw of one of the angles 1 to 4: ``b cos y + c sin y``, second harmonics and the prior."""
     own = conjugate(plan.prior[index])
     bounded = index == 2 and plan.bounded
-    if own is not None and second is None:
-        b, c = (x if extra == 0 else x + extra for x, extra in zip((b, c), own, strict=True))
+    doubled = second is not None or (own is not None and own[2:] != (0.0, 0.0))
+    if own is not None and not (bounded and doubled):
+        given = (b, c, *(second or (0.0, 0.0)))
+        b, c, d, e = (x if extra == 0 else x + extra for x, extra in zip(given, own, strict=True))
+        if doubled:
+            return two_harmonics(random, (b, c), (d, e), old)
         return half_circle(random, b, c, old) if bounded else von_mises(random, b, c, old)
     prior = plan.prior[index]
     assert prior is not None
@@ -207,8 +208,8 @@ def _retarder(
             if index != 2:
                 first, other = first + 2 * dot(rest, fa), other + 2 * dot(rest, fb)
             second = (0.5 * (dot(a, fa) - dot(b, fb)), dot(a, fb))
-        first, other, second = _kept(data.one, (first, other, second))
-        pairs[index] = _kept(data.one, _angle(plan, index, first, other, second, pairs[index], random))
+        first, other, second = random.kept((first, other, second))
+        pairs[index] = random.kept(_angle(plan, index, first, other, second, pairs[index], random))
     return Point(*pairs)
 
 

@@ -199,13 +199,13 @@ def test_both_routes_to_the_evidence_agree_and_ridges_take_the_one_that_resolves
     model = Model(gain=ComplexGain(1.0))
     truth = Parameters(np.array([0.4, 0.05, 0.999]), *(np.full(3, x) for x in (0.5, 1.2, 0.4, 0.2)))
     data = simulate(model, truth, BALANCED, 0.02, rng=2)
-    by_default = sample(model, data, draws=500, rng=1)
+    by_default = sample(model, data, draws=1000, rng=1)
     assert np.all(by_default.log_evidence_error < 0.02)
     monkeypatch.setattr(verb, "POOR", np.inf)
-    conditionals = sample(model, data, draws=500, rng=1)
+    conditionals = sample(model, data, draws=1000, rng=1)
     assert conditionals.log_evidence_error[2] > 0.1
     monkeypatch.setattr(verb, "POOR", 0.0)
-    bridged = sample(model, data, draws=500, rng=2)
+    bridged = sample(model, data, draws=1000, rng=2)
     for other in (conditionals, by_default):
         error = np.hypot(bridged.log_evidence_error, other.log_evidence_error)
         assert np.all(np.abs(bridged.log_evidence - other.log_evidence) < 4 * error)

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import chisquare, kstest, norm, vonmises
 from scipy.stats import gamma as gamma_distribution
-from scipy.stats import kstest, norm, vonmises
 
 from polinfer.sampling.gibbs import circle
-from polinfer.sampling.gibbs.random import Random, begin
+from polinfer.sampling.gibbs.random import WEYL, Random, begin, word
 
 LANES, STEPS = 4000, 40
 LEAST = 1e-4  # probability below which a test of a fixed seed objects
@@ -75,6 +75,7 @@ def test_half_circle(b, c):
 CASES = [
     (0.0, 0.0, 0.0, 0.0), (5.0, 1.0, 0.3, 4.0), (900.0, 100.0, 0.0, 4.0), (800.0, 780.0, 0.0, 4.0),
     (500.0, 900.0, 0.0, 4.0), (-3.0, 1.0, 2.0, 0.0), (50.0, -45.0, -6.0, 25.0),
+    (1000.0, -900.0, 350.0, 0.0), (1000.0, 400.0, -350.0, 4.0), (3000.0, -2000.0, 1200.0, 0.0),
 ]  # fmt: skip
 
 
@@ -91,6 +92,35 @@ def test_diattenuation(b, c, linear, square):
         return b * np.cos(y) + c * np.sin(y) + linear * d - 0.5 * square * d * d + edge
 
     assert kstest(found, numerical(log_density, -np.pi / 4, np.pi / 4)).pvalue > LEAST
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", [1e2, 1e4, 1e6])
+def test_most_candidates_of_the_diattenuation_are_taken_where_its_linear_part_is_large(size, dtype):
+    # the log likelihood -|Y - J R|^2 of data without noise, light of power ``size`` and Stokes parameter ``-linear``
+    rng = np.random.default_rng(2)
+    y, stokes = rng.uniform(-0.6, 0.6, (1, LANES)), size * rng.uniform(-0.9, 0.9, (1, LANES))
+    along, across = 2 * (size + stokes * np.sin(2 * y)), 2 * stokes * np.cos(2 * y)
+    b, c, linear = along * np.cos(y) - across * np.sin(y), along * np.sin(y) + across * np.cos(y), -stokes
+    given = [jnp.asarray(x, dtype) for x in (b, c, linear, np.zeros_like(b))]
+    last = [run(lambda random, old: circle.diattenuation(random, *given, old), (1.0, 0.0), dtype, 6, steps)
+            for steps in (30, 31)]  # fmt: skip
+    assert np.mean(last[0][1] != last[1][1]) > 0.6
+
+
+TWO = [
+    (0.0, 0.0, 0.0, 0.0), (3.0, 1.0, 0.5, 0.2), (30.0, -40.0, 12.0, 9.0), (-400.0, 100.0, 120.0, 10.0),
+    (0.5, 0.0, 1.5, 0.0), (2.0, 0.0, -2.0, 0.0), (1e4, 3e3, -2e3, 1e3), (0.1, 0.4, 0.2, -1.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("b", "c", "d", "e"), TWO)
+def test_two_harmonics(b, c, d, e, dtype):
+    first, second = ([jnp.full((1, LANES), x, dtype) for x in pair] for pair in ((b, c), (d, e)))
+    found = angles(run(lambda random, old: circle.two_harmonics(random, first, second, old), (1.0, 0.0), dtype, 7, 200))
+    cdf = numerical(lambda y: b * np.cos(y) + c * np.sin(y) + d * np.cos(2 * y) + e * np.sin(2 * y), -np.pi, np.pi)
+    assert kstest(found, cdf).pvalue > LEAST
 
 
 def test_slices_of_a_density_with_two_peaks():
@@ -111,7 +141,7 @@ def test_gamma(shape):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_words_are_uniform_and_lanes_unrelated(dtype):
-    stream, rows = begin(9, np.arange(LANES), 1), []
+    stream, rows = jax.tree.map(jnp.asarray, begin(9, np.arange(LANES), 1)), []
     for _ in range(8):
         random = Random(stream, dtype)
         rows.append(np.asarray(random.uniform(), float)[0])
@@ -124,9 +154,29 @@ def test_words_are_uniform_and_lanes_unrelated(dtype):
     assert abs(np.corrcoef(values[:, :-1].ravel(), values[:, 1:].ravel())[0, 1]) < 5 / (8 * LANES) ** 0.5
 
 
+def test_no_bit_no_pair_of_words_and_no_two_lanes_with_near_keys_are_related():
+    keys = np.arange(256, dtype=np.uint32)  # next to each other: the worst that can be
+    count = 4096
+
+    for first, second in ((keys, 0 * keys), (0 * keys, keys), (keys * WEYL, keys)):
+        words = np.asarray(word((first, second, np.arange(count, dtype=np.uint32)[:, None])))  # (words, lanes)
+        bits = np.unpackbits(words.T.copy().view(np.uint8), axis=1).reshape(len(keys), count, 32).astype(np.float32)
+        signs = 2 * bits - 1
+        total = signs.size / 32
+        assert np.abs(signs.sum(axis=(0, 1))).max() < 4.5 * total**0.5  # 32 numbers
+        # with the next word and with the same one of the next lane, bit by bit: 1024 pairs each
+        flat = signs.reshape(-1, 32)
+        for other in (np.roll(signs, 1, axis=1), np.roll(signs, 1, axis=0)):
+            assert np.abs(flat.T @ other.reshape(-1, 32)).max() < 5.5 * total**0.5
+        # and as points of a square of 64 x 64 cells
+        for other in (np.roll(words, 1, axis=0), np.roll(words, 1, axis=1)):
+            cells = np.bincount(((words >> 26) * 64 + (other >> 26)).ravel(), minlength=4096)
+            assert chisquare(cells).pvalue > LEAST
+
+
 def test_streams_depend_on_seed_pixel_chain_and_purpose_only():
     whole, part = begin(3, np.arange(10), 2), begin(3, np.array([4, 7]), 2)
-    for a, b in zip(whole, part, strict=True):
+    for a, b in zip(whole[:2], part[:2], strict=True):
         np.testing.assert_array_equal(a[:, [4, 7]], b)
     assert len(np.unique(whole[0])) == 20
     for other in (begin(4, np.arange(10), 2), begin(3, np.arange(10), 2, purpose=1)):
