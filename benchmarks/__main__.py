@@ -46,6 +46,7 @@ ALL = (
     "cohort_contrast",
     "acquisition",
     "streaming",
+    "checks",
     "accelerator",
 )
 

@@ -53,7 +53,7 @@ def test_frames_become_jones_data_by_four_commands(bench, tmp_path):
     np.testing.assert_allclose(load(measurement).sigma, expected.sigma, rtol=1e-9)
 
 
-@pytest.mark.parametrize("method", ["modal", "accelerated"])
+@pytest.mark.parametrize("method", ["modal", pytest.param("accelerated", marks=pytest.mark.slow)])
 def test_other_methods_of_retrieval_see_the_same_fields(bench, tmp_path, method):
     """From 8-bit frames of the bench, through fibrelets that were found in them."""
     calibration, out = save(bench.calibration, tmp_path / "calibration.nc"), tmp_path / "fields.nc"

@@ -40,7 +40,7 @@ def inverse(standard):
     return recover(standard.calibration(NOISE, 1), ForwardInverse())
 
 
-@pytest.mark.parametrize("noise", [NOISE, 0.07 * NOISE])
+@pytest.mark.parametrize("noise", [NOISE, pytest.param(0.07 * NOISE, marks=pytest.mark.slow)])
 def test_a_calibration_that_holds_seldom_raises_an_alarm(standard, inverse, noise):
     """With little noise light of points far from a fibrelet would be taken for a change, were it left out."""
     found = [
@@ -113,7 +113,8 @@ def test_probes_of_another_calibration_are_refused(standard, inverse):
 
 
 @pytest.mark.parametrize(
-    ("state", "count"), [("5.04", 10), ("5.12", 20), pytest.param("5.04", 40, marks=pytest.mark.slow)]
+    ("state", "count"),
+    [("5.04", 10), pytest.param("5.12", 20, marks=pytest.mark.slow), pytest.param("5.04", 40, marks=pytest.mark.slow)],
 )
 def test_a_measured_fibre_that_was_pressed_is_followed(state, count):
     """5.04: small changes all over. 5.12: nothing of the old matrix is left but where it was strong."""

@@ -161,7 +161,7 @@ def density_derivatives(model):
         ("retarder_first", "none", {}, {"diattenuation": 0.3}, False),
         ("retarder_first", "complex", PRIORS, {}, False),
         ("polariser_first", "none", PRIORS, {}, True),
-        ("polariser_first", "phase", PRIORS, {}, False),
+        pytest.param("polariser_first", "phase", PRIORS, {}, False, marks=pytest.mark.slow),
         ("polariser_first", "complex", {}, {"diattenuation_angle": 0.4}, False),
     ],
 )

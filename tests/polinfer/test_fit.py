@@ -42,7 +42,7 @@ from tests.polinfer.scenes import (
     [
         ("retarder_first", "complex", BALANCED, 0.1),
         ("polariser_first", "none", UNBALANCED, 0.3),
-        ("polariser_first", "phase", UNBALANCED, 0.4),
+        pytest.param("polariser_first", "phase", UNBALANCED, 0.4, marks=pytest.mark.slow),
         pytest.param("retarder_first", "none", BALANCED, 0.4, marks=pytest.mark.slow),
         pytest.param("retarder_first", "phase", BALANCED, 0.2, marks=pytest.mark.slow),
         pytest.param("polariser_first", "complex", UNBALANCED, 0.05, marks=pytest.mark.slow),

@@ -46,7 +46,10 @@ def test_covariance_is_the_inverse_of_the_finite_difference_hessian():
     np.testing.assert_allclose(np.stack(result.std), np.sqrt(np.einsum("pii->ip", result.covariance)))
 
 
-@pytest.mark.parametrize(("ordering", "gain"), [("retarder_first", "none"), ("polariser_first", "complex")])
+@pytest.mark.parametrize(
+    ("ordering", "gain"),
+    [("retarder_first", "none"), pytest.param("polariser_first", "complex", marks=pytest.mark.slow)],
+)
 def test_errors_reach_the_cramer_rao_bound_and_the_stated_width(ordering, gain):
     pixels, sigma = 2000, 0.01
     truth = Parameters(0.3, 0.4, 1.3, 0.6, 0.3)

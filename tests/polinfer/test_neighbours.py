@@ -175,7 +175,7 @@ def test_sums_over_a_window_keep_the_digits_of_a_high_signal(gain, kind, noise):
         assert got[place] == pytest.approx(expected, abs=1e-3 if noise > 1e-5 else 1e-4)
 
 
-@pytest.mark.parametrize("gain", ["none", "complex"])
+@pytest.mark.parametrize("gain", ["none", pytest.param("complex", marks=pytest.mark.slow)])
 def test_a_window_over_the_whole_frame_gives_every_pixel_the_same_fit_and_sharper_widths(gain):
     truth = everywhere((3, 3), (0.4, 0.5, 1.3, 0.6, 0.2))
     measurement = simulate(Model(gain=GAINS[gain]), truth, BALANCED, 0.05, rng=3)
@@ -201,7 +201,11 @@ def test_a_window_over_the_whole_frame_gives_every_pixel_the_same_fit_and_sharpe
 
 @pytest.mark.parametrize(
     ("gain", "noise"),
-    [("none", "known"), ("complex", "known"), pytest.param("phase", "pixel", marks=pytest.mark.slow)],
+    [
+        ("none", "known"),
+        pytest.param("complex", "known", marks=pytest.mark.slow),
+        pytest.param("phase", "pixel", marks=pytest.mark.slow),
+    ],
 )
 def test_the_fit_of_a_window_is_a_maximum_of_the_windowed_density(gain, noise):
     measurement = scene("weights" if gain == "none" else "shared", (3, 4), sigma=0.1)

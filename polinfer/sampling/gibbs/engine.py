@@ -232,14 +232,13 @@ def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     return r_hat, effective
 
 
-def _judged(problem: Problem, store: _Chains, pixels: np.ndarray, near: dict[str, np.ndarray]) -> np.ndarray:
-    """Least effective draws of some pixels by the sum of all autocorrelations: slower than batches, and longer ones.
+def _judged(problem: Problem, store: _Chains, near: dict[str, np.ndarray]) -> np.ndarray:
+    """Least effective draws by the sum of all autocorrelations, which is slower than batches and sees longer ones.
 
-    ``near``: the invariants that matter, for each a bool per pixel.
+    ``near``: the invariants that matter, for each a bool per pixel; infinite where none does.
     """
-    gain, precision = (None if x is None else x[..., pixels] for x in (store.gain, store.precision))
-    sigma = None if precision is None else precision**-0.5
-    return least_effective(problem.model, Parameters(*store.parameters[..., pixels]), gain, sigma, near)
+    # of a logarithm: that of the precision is as good as that of sigma
+    return least_effective(problem.model, Parameters(*store.parameters), store.gain, store.precision, near)
 
 
 def _run(
@@ -316,12 +315,12 @@ def draw_gibbs(
     r_hat, effective = np.empty(count), np.empty(count)
     for attempt, more in enumerate((1, *MORE)):
         _run(problem, store, pixels, numbers, chains, sampler, sampler.thin * more, seed, attempt, done)
-        found, number = convergence(store.sums[..., pixels], store.length)
-        near = number < NEAR * enough
-        some = near.any(axis=0)
-        least = _judged(problem, store, pixels[some], dict(zip(names, near[:, some], strict=True)))
-        r_hat[pixels], effective[pixels] = found.max(axis=0), number.min(axis=0)
-        effective[pixels[some]] = np.minimum(effective[pixels[some]], least)
+        sums = store.sums if len(pixels) == count else store.sums[..., pixels]
+        found, number = convergence(sums, store.length)
+        near = np.zeros((len(names), count), bool)
+        near[:, pixels] = number < NEAR * enough
+        least = _judged(problem, store, dict(zip(names, near, strict=True)))
+        r_hat[pixels], effective[pixels] = found.max(axis=0), np.minimum(number.min(axis=0), least[pixels])
         pixels = pixels[(r_hat[pixels] > largest) | (effective[pixels] < surely)]
         if known.noise == "frame" or len(pixels) == 0:
             break
