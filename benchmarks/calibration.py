@@ -28,14 +28,21 @@ CASES: list[tuple[Model, float | None]] = [
     for ordering, gain, sigma in product((RetarderFirst(), PolariserFirst()), (None, ComplexGain(1.0)), SIGMAS)
 ]
 CASES.append((Model(noise=InferredNoise(3.0, 0.3, "pixel")), None))
+# light three times as strong in one polarisation as in the other, whose conditionals have second harmonics
+BALANCED, UNBALANCED = scenes.balanced_states(), scenes.conditioned_states(3**0.5, np.random.default_rng(1))
+SKEW: list[tuple[Model, float | None]] = [
+    (Model(ordering, gain=gain), sigma)
+    for ordering, gain, sigma in product((RetarderFirst(), PolariserFirst()), (None, ComplexGain(1.0)), (0.02, 0.2))
+]
 GIBBS, ENSEMBLE = Gibbs(thin=4, evidence=False), Ensemble(warmup=100, thin=20, evidence=False)
 
 
 def calibrate(results: Results, sampler: Gibbs | Ensemble, simulations: int, draws: int, axes: Any) -> None:
     """All cases of one sampler."""
-    name, states = type(sampler).__name__, scenes.balanced_states()
+    name = type(sampler).__name__
     smallest, tests, off = 1.0, 0, 0.0
-    for number, (model, sigma) in enumerate(CASES):
+    cases = [(*case, BALANCED) for case in CASES] + [(*case, UNBALANCED) for case in SKEW]
+    for number, (model, sigma, states) in enumerate(cases):
         found = ranks_of(model, states, sigma, simulations, sampler, rng=number, draws=draws)
         p = found.p_values()
         smallest, tests = min(smallest, float(p.min())), tests + len(p)
@@ -43,7 +50,8 @@ def calibrate(results: Results, sampler: Gibbs | Ensemble, simulations: int, dra
         off = max(off, *(100 * float(np.abs(values.mean() - level)) for level, values in cover.items()))
         results.add(
             sampler=name, ordering=type(model.ordering).__name__, gain=type(model.gain).__name__,
-            sigma=sigma or "inferred", simulations=simulations, least_p=float(p.min()),
+            light="balanced" if states is BALANCED else "3 : 1", sigma=sigma or "inferred", simulations=simulations,
+            least_p=float(p.min()),
             **{f"inside_{100 * k:.0f}": f"{100 * v.min():.1f}-{100 * v.max():.1f}" for k, v in cover.items()},
         )  # fmt: skip
         place = np.sort((found.ranks + 0.5) / (found.draws + 1), axis=1)
