@@ -238,8 +238,8 @@ def least_effective(
 ) -> np.ndarray:  # fmt: skip
     """Smallest effective sample size of draws ``(chain, draw, pixel)``, of those functions and pixels only that matter.
 
-    ``wanted``: names of the functions and for each a bool per pixel; infinite where none is wanted. In the draws' own
-    precision.
+    ``wanted``: names of the functions and for each a bool per pixel; infinite where none is wanted. Functions that the
+    model keeps constant are passed over: only rounding changes them. In the draws' own precision.
 
     >>> rng = np.random.default_rng(1)
     >>> draws = Parameters(*(0.5 + 0.1 * rng.normal(size=(5, 4, 250, 2))))
@@ -257,7 +257,7 @@ def least_effective(
         found = _functions(model, values, *(None if x is None else rows(x, part, double=False) for x in (gain, sigma)))
         for name, needed in wanted.items():
             some = np.flatnonzero(needed[part])
-            if len(some):
+            if len(some) and name in found:
                 least[part[some]] = np.minimum(least[part[some]], _assess(found[name][some])[1])
 
     each(judge, range(len(parts)))

@@ -56,7 +56,8 @@ def unavailable(plan: Plan) -> str | None:
         return "a part of the retarder is fixed"
     if 0 in plan.free and (plan.prior[0] is None or normal(plan.prior[0]) is None):
         return "the prior of the diattenuation is neither flat nor normal"
-    if 1 in plan.free and (conjugate(plan.prior[1]) or (1.0,))[2:] != (0.0, 0.0):
+    added = conjugate(plan.prior[1])
+    if 1 in plan.free and (added is None or added[2:] != (0.0, 0.0)):
         return "the prior of the diattenuation's angle is neither flat nor von Mises"
     return None
 

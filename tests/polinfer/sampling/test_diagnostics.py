@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from polinfer import ComplexGain, Model, Parameters, PhaseGain, PolariserFirst, orbit
 from polinfer.elements import polariser, retarder
-from polinfer.sampling.diagnostics import diagnose, effective_sample_size, split_r_hat
+from polinfer.sampling.diagnostics import diagnose, effective_sample_size, least_effective, split_r_hat
 from polinfer.sampling.invariants import invariants
 from tests.polinfer.sampling.made import around, autoregressive, draws_of
 
@@ -202,3 +202,17 @@ def test_a_record_says_which_invariant_is_meant(tmp_path):
         back = polinfer.load(polinfer.save(told, tmp_path / f"told{ending}"))
         np.testing.assert_array_equal(back.ess, told.ess)
         assert back.names == told.names
+
+
+def test_the_least_number_of_some_functions_is_that_of_all_and_constant_ones_are_passed_over():
+    rng = np.random.default_rng(4)
+    draws = Parameters(*(0.5 + 0.1 * rng.normal(size=(5, 4, 200, 3))))
+    gain = 0.8 + 0.1 * (rng.normal(size=(4, 200, 3)) + 1j * rng.normal(size=(4, 200, 3)))
+    model = Model(gain=ComplexGain(1.0))
+    whole = diagnose(model, draws, gain, None, np.zeros(3, int))
+    every = dict.fromkeys(whole.names, np.array([True, True, False]))
+    found = least_effective(model, draws, gain, None, every)
+    np.testing.assert_allclose(found[:2], whole.worst_ess[:2])
+    assert np.isinf(found[2])
+    fixed = Model(gain=ComplexGain(1.0), fixed={"diattenuation": 0.5, "diattenuation_angle": 0.5})
+    assert np.isinf(least_effective(fixed, draws, gain, None, {"polariser.size": np.ones(3, bool)})).all()
