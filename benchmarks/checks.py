@@ -1,6 +1,6 @@
 """The slow tests and the whole width of the random ones: ``pytest -m slow``, then the parsers with POLINFER_FUZZ=fuzz.
 
-They take longer than a change should wait for; each has a quick sibling in the ordinary run. Reported: how many passed,
+They take longer than a change should wait for; most are further cases of a quick test. Reported: how many passed,
 failed and were skipped, and the time; the bar is that none fails.
 """
 

@@ -144,7 +144,6 @@ def test_fixed_values_are_kept_where_other_starts_are_tried(fixed):
     np.testing.assert_allclose(fast.log_posterior, at_maximum, atol=1e-8)
 
 
-@pytest.mark.slow  # a model of its own to compile
 def test_of_two_copies_with_nearly_the_same_density_the_better_one_is_found():
     model = Model(priors=PRIORS)
     response = [
@@ -166,7 +165,6 @@ EDGES = Parameters(
 )  # fmt: skip
 
 
-@pytest.mark.slow  # the general route to compile
 def test_at_and_near_bounds_the_evidence_is_that_of_importance_sampling_and_of_the_general_route():
     truth = Parameters(*(np.repeat(x, 4) for x in np.broadcast_arrays(*EDGES)))
     matrices = np.asarray(FREE.jones(truth)) @ BALANCED
@@ -259,7 +257,6 @@ def test_what_is_shipped_goes_the_fast_route_and_what_is_not_the_general_one(mod
     assert (fast_scene(model) is not None) == fast
 
 
-@pytest.mark.slow  # two models to compile by both routes
 def test_small_frames_by_their_statistics_have_the_answers_of_their_responses():
     """Of four unbalanced states, one without weight, sigma by pixels: the two sides of the limit of small frames."""
     rng = np.random.default_rng(7)

@@ -131,7 +131,6 @@ def test_float32_agrees_at_high_signal(gain):
     assert float(low) == pytest.approx(float(high), abs=0.02)
 
 
-@pytest.mark.slow  # a model of its own to compile
 def test_intervals_and_sigma_hold_what_they_say_when_sigma_is_unknown_in_every_pixel():
     pixels, sigma = 1000, 0.02
     truth = everywhere(pixels, (0.4, 0.5, 1.3, 0.6, 0.2))

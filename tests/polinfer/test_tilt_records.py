@@ -34,7 +34,6 @@ def draws(data):
     return polinfer.sample(TILTED, data, Gibbs(evidence=False), chains=2, draws=1000, rng=3)
 
 
-@pytest.mark.slow  # a fit and a sampler of their own to compile
 def test_draws_have_the_width_of_pixel_and_tilt_together(draws, found, data):
     width = np.std(draws.parameters.circularity, axis=(0, 1))
     given = polinfer.sample(Model(), untilt(data, found.tilt.phase), Gibbs(evidence=False), chains=2, draws=1000, rng=3)

@@ -135,7 +135,6 @@ def test_regions_are_pooled_by_themselves():
         compare(fitted(data), regions=labels * 1.0)
 
 
-@pytest.mark.slow  # two models to compile
 def test_select_gives_a_model_that_infers_sigma_data_without_one():
     data = measured(diattenuation=0.0, sigma=0.05)
     candidates = {"known": RETARDER, "inferred": replace(RETARDER, noise=InferredNoise(1.0, 0.0025, "pixel"))}

@@ -112,7 +112,6 @@ def test_draws_of_gain_and_sigma_belong_to_the_draws_of_the_parameters():
     assert abs(np.mean((0.02 + square) / draws.sigma**2) - 9) < 0.15
 
 
-@pytest.mark.slow  # a model of its own to compile
 def test_one_sigma_of_the_frame():
     rng = np.random.default_rng(4)
     truth = prior_draws(Model(), 60, rng)
