@@ -1,8 +1,8 @@
 """Raw frames on disk and the manifest that says which are complete.
 
 One file of raw frames per capture, written under another name, flushed to the disk and renamed; then one line in an
-append-only manifest, flushed too. A capture exists when its line does. In: frames. Out: lazily merged images. Called
-by the run.
+append-only manifest, flushed too. A capture exists when its line does. In: frames. Out: the same frames. Called by the
+run.
 """
 
 from __future__ import annotations
@@ -10,16 +10,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from acquisition.errors import RunMismatch
-from acquisition.exposure import Merged, MergeRule, merge_views
 
-__all__ = ["Folder", "MergedStack"]
+__all__ = ["Folder"]
 
 MANIFEST = "manifest.jsonl"
 
@@ -134,44 +132,3 @@ class Folder:
             return False
         path = self.path / f"{identity}.npz"
         return path.exists() and path.stat().st_size == self.done[identity]["bytes"]
-
-
-@dataclass(frozen=True)
-class MergedStack:
-    """A (capture, image, y, x) array that merges raw exposures when a capture is asked for.
-
-    ``part`` is the field of :class:`acquisition.Merged` to show: radiance, variance or saturated. The last capture
-    merged is remembered in ``cache``, which the three stacks of a run share, since all are asked for in turn.
-    """
-
-    folder: Folder
-    identities: tuple[str, ...]
-    full_scale: int
-    rule: MergeRule
-    shape: tuple[int, int, int, int]
-    part: str
-    cache: dict[str, Merged]
-
-    @property
-    def dtype(self) -> np.dtype:
-        """float32, or bool for the saturation mask."""
-        return np.dtype(bool if self.part == "saturated" else np.float32)
-
-    def __len__(self) -> int:
-        return len(self.identities)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        identity = self.identities[index]
-        if identity not in self.cache:
-            frames, exposures = self.folder.load(identity)
-            self.cache.clear()
-            self.cache[identity] = merge_views(frames, exposures, self.full_scale, self.rule)
-        part: np.ndarray = getattr(self.cache[identity], self.part).view()
-        part.flags.writeable = False  # it is the cache's own
-        return part
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        if copy is False:
-            raise ValueError("a lazy stack cannot be an array without a copy.")
-        whole = np.stack([self[i] for i in range(len(self))])
-        return whole if dtype is None else whole.astype(dtype)

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from acquisition.contracts import AnyBench, bracketed, leave_safely
+from acquisition.contracts import AnyBench, leave_safely
 from acquisition.errors import DeviceLost, DeviceTimeout, FrameLost
+from acquisition.images import expose, merged_images
 from acquisition.plan import GridPlan, Plan, SamplePlan, Step, Views
-from acquisition.recording import Folder, MergedStack
+from acquisition.recording import Folder
 from fibre import Calibration, Images, Recording
 from polinfer.checks import one_of_types, real_number
 
@@ -156,37 +157,18 @@ def _surely(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, 
 
 def _take(bench: AnyBench, plan: Plan, step: Step, points: np.ndarray | None, store: Folder, **more: Any) -> None:
     """One capture: all exposures of all its views, then on the disk."""
-    bench.prepare(step, plan.views, plan.illumination, points)
-    started = bench.time()
-    images = [bracketed(bench, view, plan.views.bracket) for view in range(len(plan.views))]
+    taken = expose(bench, step, plan.views, plan.illumination, points)
     store.store(
         step.id,
-        [np.stack([frame.counts for frame in image]) for image in images],
-        [[frame.exposure for frame in image] for image in images],
-        started,
-        bench.time(),
-        blocks=[[frame.block for frame in image] for image in images],
-        saturated=[[int((frame.counts >= bench.full_scale).sum()) for frame in image] for image in images],
+        taken.counts,
+        taken.exposures,
+        taken.started,
+        taken.ended,
+        blocks=[[frame.block for frame in image] for image in taken.images],
+        saturated=[[int((frame.counts >= bench.full_scale).sum()) for frame in image] for image in taken.images],
         **more,
     )
 
 
 def _images(bench: AnyBench, views: Views, store: Folder, names: list[str]) -> Images:
-    identities = tuple(names)
-    frames, _ = store.load(identities[0])
-    shape = (len(identities), len(views), *frames[0].shape[-2:])
-    cache: dict = {}
-    radiance, variance, saturated = (
-        MergedStack(store, identities, bench.full_scale, bench.merge_rule, shape, part, cache)
-        for part in ("radiance", "variance", "saturated")
-    )
-    return Images(
-        radiance,
-        variance,
-        saturated,
-        np.array(views.diversity),
-        np.array(views.steps),
-        np.array([store.done[i]["time"] for i in identities]),
-        bench.wavelength,
-        bench.pixel_size,
-    )
+    return merged_images(bench, views, store, {name: store.done[name]["time"] for name in names})

@@ -12,16 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
-from acquisition.contracts import AnyBench, bracketed
-from acquisition.plan import SamplePlan, Step
+from acquisition.contracts import AnyBench
+from acquisition.images import Held, expose, merged_images
+from acquisition.plan import SamplePlan
 from fibre import Images, Inverse, Recording, RecordingFields, reconstruct, retrieve_fields, retrieve_sample
 from fibre.retrieval.base import RetrievalMethod
 from polinfer import Fit, Measurement, Model, fit
 from polinfer.checks import integer, one_of_types, real_number
-
-from .exposure import merge_views
 
 __all__ = ["FibreImager", "Imager", "StreamedFrame", "stream"]
 
@@ -53,15 +50,12 @@ class FibreImager:
         self._fields: RecordingFields | None = None
 
     def expose(self, plan: SamplePlan) -> Images:
-        """Images of the sample in all states, merged."""
+        """Images of the sample in all states; their brackets are merged when they are read."""
         if self._first is None:
-            parts = {
-                kind: self._images(plan, [step for step in plan.captures if step.kind == kind])
-                for kind in ("reference", "blank", "sample")
-            }
+            parts = {kind: self._images(plan, kind) for kind in ("reference", "blank", "sample")}
             self._first = Recording(parts["sample"], plan.illumination, parts["blank"], parts["reference"])
             return parts["sample"]
-        return self._images(plan, [step for step in plan.captures if step.kind == "sample"])
+        return self._images(plan, "sample")
 
     def measurement(self, raw: Images) -> Measurement:
         """Fields, then Jones matrices at the distal points."""
@@ -74,20 +68,10 @@ class FibreImager:
                 return reconstruct(self.inverse, self._fields)
         return reconstruct(self.inverse, retrieve_sample(raw, self.method, calibration, self._fields))
 
-    def _images(self, plan: SamplePlan, steps: list[Step]) -> Images:
-        views, merged, times = plan.views, [], []
-        for step in steps:
-            self.bench.prepare(step, views, plan.illumination, None)
-            times.append(self.bench.time())
-            images = [bracketed(self.bench, view, views.bracket) for view in range(len(views))]
-            counts = [np.stack([frame.counts for frame in image]) for image in images]
-            taken = [[frame.exposure for frame in image] for image in images]
-            merged.append(merge_views(counts, taken, self.bench.full_scale, self.bench.merge_rule))
-        radiance, variance, saturated = (
-            np.stack([getattr(m, part) for m in merged]) for part in ("radiance", "variance", "saturated")
-        )
-        return Images(radiance, variance, saturated, np.array(views.diversity), np.array(views.steps), np.array(times),
-                      self.bench.wavelength, self.bench.pixel_size)  # fmt: skip
+    def _images(self, plan: SamplePlan, kind: str) -> Images:
+        steps = [step for step in plan.captures if step.kind == kind]
+        raw = Held({step.id: expose(self.bench, step, plan.views, plan.illumination, None) for step in steps})
+        return merged_images(self.bench, plan.views, raw, raw.times)
 
 
 @dataclass(frozen=True)

@@ -2,53 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
-from acquisition import GridPlan, SimulatedBench, Step
-from acquisition.contracts import bracketed
-from acquisition.exposure import merge_views
-from fibre import Calibration, Images
+from acquisition import GridPlan, SimulatedBench
+from acquisition.images import Exposed, expose, merged_images
+from fibre import Calibration
 
 
-@dataclass
 class _Live:
-    """One part (radiance, variance, saturated) of a (capture, image, y, x) stack; the last capture is remembered."""
+    """Raw captures of a bench, exposed when they are asked for; the last one is remembered."""
 
-    bench: SimulatedBench
-    plan: GridPlan
-    steps: list[Step]
-    part: str
-    cache: dict = field(default_factory=dict)
+    def __init__(self, bench: SimulatedBench, plan: GridPlan) -> None:
+        self.bench, self.plan = bench, plan
+        self.steps = {step.id: step for step in plan.captures}
+        self.last: tuple[str, Exposed] | None = None
 
-    @property
-    def shape(self) -> tuple[int, int, int, int]:
-        return (len(self.steps), len(self.plan.views), *self.bench.scene.camera.shape)
-
-    def __len__(self) -> int:
-        return len(self.steps)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        step, bench = self.steps[index], self.bench
-        if step.id not in self.cache:
-            bench.prepare(step, self.plan.views, self.plan.illumination, self.plan.points)
-            images = [bracketed(bench, view, self.plan.views.bracket) for view in range(len(self.plan.views))]
-            counts = [np.stack([frame.counts for frame in image]) for image in images]
-            times = [[frame.exposure for frame in image] for image in images]
-            self.cache.clear()
-            self.cache[step.id] = merge_views(counts, times, bench.full_scale, bench.merge_rule)
-        return getattr(self.cache[step.id], self.part)
+    def load(self, identity: str) -> tuple[list[np.ndarray], list[list[float]]]:
+        if self.last is None or self.last[0] != identity:
+            plan = self.plan
+            self.last = identity, expose(self.bench, self.steps[identity], plan.views, plan.illumination, plan.points)
+        return self.last[1].counts, self.last[1].exposures
 
 
 def calibration(bench: SimulatedBench, plan: GridPlan) -> Calibration:
     """As :func:`acquisition.calibrate` would make it, without a folder."""
-
-    def images(kind: str) -> Images:
-        steps, cache = [step for step in plan.captures if step.kind == kind], {}
-        stacks = [_Live(bench, plan, steps, part, cache) for part in ("radiance", "variance", "saturated")]
-        views = plan.views
-        return Images(*stacks, np.array(views.diversity), np.array(views.steps), np.arange(len(steps), dtype=float),
-                      bench.wavelength, bench.pixel_size)  # fmt: skip
-
-    return Calibration(images("spots"), plan.inputs, plan.points, plan.grid, images("reference"), bench.registration)
+    raw = _Live(bench, plan)
+    spots, references = (
+        merged_images(bench, plan.views, raw, {s.id: float(i) for i, s in enumerate(plan.captures) if s.kind == kind})
+        for kind in ("spots", "reference")
+    )
+    return Calibration(spots, plan.inputs, plan.points, plan.grid, references, bench.registration)

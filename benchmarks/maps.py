@@ -2,9 +2,10 @@
 
 A bundle that fills the frame, its inverse from calibration fields with 2 % of noise, a lesion finer than the points,
 focus 0.3 % and phase steps 5 mrad off. The blank was recorded before, as in a series of samples. Timed, in turn, code
-compiled and geometry made before: the merge of the brackets (two to four frames an image), the fields of the three
-captures, the Jones data, the fit, and posteriors instead of it; beside them one pair of FFTs of a frame and the paper's
-own figures. "one step": one Gauss-Newton step of three conjugate gradients; "to the end": until it changes no more.
+compiled and geometry made before: the fields of the three captures, the merge of their brackets (two to four frames an
+image) with them, the Jones data, the fit, and posteriors instead of it; beside them one pair of FFTs of a frame and the
+paper's own figures. "one step": one Gauss-Newton step of three conjugate gradients; "to the end": until it changes no
+more.
 
 Errors: chi-square per degree of freedom of the fitted Jones matrices against the truth, and the noise that the data
 state, relative to the light.
@@ -23,16 +24,14 @@ import scipy.sparse
 
 import polinfer
 from acquisition import CalibrationPlan, SamplePlan, SimulatedBench, Step
-from acquisition.contracts import bracketed
 from acquisition.demo import FULL_GRID, FULL_SIDE, full_setup
-from acquisition.exposure import merge_views
+from acquisition.images import Held, expose, merged_images
 from benchmarks.results import Results
 from fibre import (
     Bundle,
     CalibrationFields,
     Fibrelets,
     ForwardInverse,
-    Images,
     Inverse,
     Modal,
     Recording,
@@ -47,19 +46,18 @@ from polinfer.validation import jones_chi_square
 
 STRIDE, WAIST, NOISE = 9, 2.5e-6, 0.02
 SAMPLER = Gibbs(effective=1000, evidence=False)
-STAGES = ("merge", "fields", "jones", "fit", "posterior")
+STAGES = ("fields", "jones", "fit", "posterior")
 PAPER = {"fields": 3 * 67.0, "fit": 24 * 60.0}  # seconds, on its hardware of 2018
 
 
 @dataclass
 class Sample:
-    """raw: for every capture and view, the frames and their exposures. before: the fields of an earlier recording, for
-    its blank. jones: the truth."""
+    """raw: of the sample. before: the fields of an earlier recording, for its blank. jones: the truth."""
 
     bench: SimulatedBench
     plan: SamplePlan
     inverse: Inverse
-    raw: list[list[tuple[np.ndarray, list[float]]]]
+    raw: Held
     before: RecordingFields
     jones: np.ndarray
 
@@ -81,31 +79,10 @@ def calibrated(
     )  # fmt: skip
 
 
-def exposed(bench: SimulatedBench, plan: SamplePlan, kind: str) -> list[list[tuple[np.ndarray, list[float]]]]:
-    """Raw frames of the captures of one kind: from the longest exposure to the first that does not saturate."""
-    captures = []
-    for step in (step for step in plan.captures if step.kind == kind):
-        bench.prepare(step, plan.views, plan.illumination, None)
-        views = []
-        for view in range(len(plan.views)):
-            frames = bracketed(bench, view, plan.views.bracket)
-            views.append((np.stack([f.counts for f in frames]), [f.exposure for f in frames]))
-        captures.append(views)
-    return captures
-
-
-def merged(bench: SimulatedBench, plan: SamplePlan, raw: list[list[tuple[np.ndarray, list[float]]]]) -> Images:
-    """Radiance of raw captures."""
-    views, frame = plan.views, raw[0][0][0].shape[1:]
-    shape = (len(raw), len(views), *frame)
-    radiance, variance = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    saturated = np.empty(shape, bool)
-    for c, capture in enumerate(raw):
-        frames, times = zip(*capture, strict=True)
-        found = merge_views(frames, times, bench.full_scale, bench.merge_rule)
-        radiance[c], variance[c], saturated[c] = found.radiance, found.variance, found.saturated
-    return Images(radiance, variance, saturated, np.array(views.diversity), np.array(views.steps), np.zeros(len(raw)),
-                  bench.wavelength, bench.pixel_size)  # fmt: skip
+def exposed(bench: SimulatedBench, plan: SamplePlan, kind: str) -> Held:
+    """Raw frames of the captures of one kind."""
+    steps = [step for step in plan.captures if step.kind == kind]
+    return Held({step.id: expose(bench, step, plan.views, plan.illumination, None) for step in steps})
 
 
 def sample(seed: int = 0, side: int = FULL_SIDE, grid: tuple[int, int] = FULL_GRID) -> Sample:
@@ -115,8 +92,8 @@ def sample(seed: int = 0, side: int = FULL_SIDE, grid: tuple[int, int] = FULL_GR
     bench = SimulatedBench(scene, rng=seed)
     blank, frames, references = (exposed(bench, plan, kind) for kind in ("blank", "sample", "reference"))
     fibrelets = Fibrelets(bundle.centres, bundle.mode_radius)
-    recording = Recording(merged(bench, plan, frames), plan.illumination, merged(bench, plan, blank),
-                          merged(bench, plan, references))  # fmt: skip
+    images, *others = (merged_images(bench, plan.views, raw, raw.times) for raw in (frames, blank, references))
+    recording = Recording(images, plan.illumination, *others)
     before = retrieve_fields(recording, Modal(fibrelets), fibrelets, progress=True)
     spot = bench.amplitudes(Step("reference-0", "reference"), plan.illumination, None)
     design = CalibrationPlan(grid, pitch=scene.pitch, stride=STRIDE)
@@ -146,8 +123,7 @@ def main(size: int | None = None, full: bool = False) -> None:
             def lap(times: list[float] = times) -> None:
                 times.append(time.perf_counter())
 
-            images = merged(made.bench, made.plan, made.raw)
-            lap()
+            images = merged_images(made.bench, made.plan.views, made.raw, made.raw.times)
             fields = retrieve_sample(images, method, calibration, made.before)
             lap()
             measurement = reconstruct(made.inverse, fields)
@@ -159,7 +135,6 @@ def main(size: int | None = None, full: bool = False) -> None:
             sample_of = Measurement(*both, sigma=np.asarray(measurement.sigma, np.float32))
             draws = polinfer.sample(model, sample_of, SAMPLER, chains=4, draws=1250, rng=repeat)
             lap()
-            del images  # or the next ones need fresh memory
             start = time.perf_counter()
             scipy.fft.ifft2(scipy.fft.fft2(frame, workers=workers), workers=workers)
             pair.append(time.perf_counter() - start)
@@ -183,9 +158,10 @@ def main(size: int | None = None, full: bool = False) -> None:
             results.bar("raw to maps", to_map, 2.0, "s")
             results.bar("raw to posteriors", to_draws, 4.0, "s")
             results.bar("paper's fields over ours", PAPER["fields"] / medians["fields"], 1.0, at_least=True)
-    results.add(pair_of_ffts_milliseconds=1e3 * unit, frames=sum(len(t) for views in made.raw for _, t in views),
-                fibrelets=len(calibration.fibrelets.centres), points=len(calibration.points),
-                paper_fields_seconds=PAPER["fields"], paper_fit_seconds=PAPER["fit"])  # fmt: skip
+    frames = sum(len(image) for name in made.raw.times for image in made.raw.load(name)[0])
+    results.add(pair_of_ffts_milliseconds=1e3 * unit, frames=frames, fibrelets=len(calibration.fibrelets.centres),
+                points=len(calibration.points), paper_fields_seconds=PAPER["fields"],
+                paper_fit_seconds=PAPER["fit"])  # fmt: skip
     results.save()
 
 

@@ -16,12 +16,15 @@ import scipy.sparse
 import scipy.spatial
 
 from fibre.evolution import Evolution
-from fibre.propagation import transfer_function
+from fibre.propagation import defocus_masks
 from fibre.transmission import Frame, Transmission
 from polinfer.checks import as_generator, complex_array, integer, real_array, real_number
 from polinfer.storage import array
 
 __all__ = ["Bundle"]
+
+REACH = 4.2  # mode radii, beyond which a mode's light is left out
+TILE = 64  # pixels along a side of what is made at once
 
 
 @dataclass(frozen=True)
@@ -247,7 +250,7 @@ class Bundle:
         of unit power per square metre; ``distances`` (metres, shape Z) along the beam the field follows the exact
         angular spectrum on a frame ``padding`` times as wide, so that light leaves the frame and does not come back.
         ``oversampling`` gives that many samples per pixel and axis: frames are then (oversampling y, oversampling x).
-        The optical axis is the middle of the frame. Separable modes: a frame costs one product (y, m) (m, x).
+        The optical axis is the middle of the frame. A mode's light ends where it is less than 1e-7 of its middle's.
         """
         amplitudes = complex_array("amplitudes", amplitudes, trailing=(2, self.cores))
         distances = real_array("distances", distances, finite=True)
@@ -255,29 +258,51 @@ class Bundle:
         step = real_number("pixel_size", pixel_size, above=0) / oversampling
         inner = (shape[0] * oversampling, shape[1] * oversampling)
         outer = (inner[0] * padding, inner[1] * padding)
-        rows, columns = (self._profile(n, step, self.centres[:, axis]) for axis, n in enumerate(outer))
-        crop = tuple(slice((o - i) // 2, (o - i) // 2 + i) for o, i in zip(outer, inner, strict=True))
-        masks = transfer_function(outer, distances.ravel(), self.wavelength, step).astype(np.complex64)
+        rows, columns = (slice((o - i) // 2, (o - i) // 2 + i) for o, i in zip(outer, inner, strict=True))
+        masks = defocus_masks(outer, distances.tobytes(), self.wavelength, step)
         batch = amplitudes.reshape(-1, self.cores).astype(np.complex64)
         frames = np.empty((len(batch), distances.size, *inner), np.complex64)
         for b, c in enumerate(batch):
-            focus = (rows * c) @ columns.T
+            focus = self._in_focus(c, outer, step)
             spectrum = None
             for z, distance in enumerate(distances.ravel()):
                 if distance == 0:
-                    frames[b, z] = focus[crop]
+                    frames[b, z] = focus[rows, columns]
                     continue
                 spectrum = scipy.fft.fft2(focus, workers=-1) if spectrum is None else spectrum
-                frames[b, z] = scipy.fft.ifft2(spectrum * masks[z], workers=-1)[crop]
+                # what leaves the frame is not computed along the second axis
+                half: Any = scipy.fft.ifft(spectrum * masks[z], axis=0, workers=-1, overwrite_x=True)
+                frames[b, z] = scipy.fft.ifft(half[rows], axis=1, workers=-1)[:, columns]
         frames = frames.reshape(*amplitudes.shape[:-1], *distances.shape, *inner)
         return np.moveaxis(frames, amplitudes.ndim - 2, -3)
 
-    def _profile(self, n: int, step: float, centres: np.ndarray) -> np.ndarray:
-        u = (np.arange(n) - (n - 1) / 2) * step
-        width = self.mode_radius
-        return (np.sqrt(np.sqrt(2 / np.pi) / width) * np.exp(-(((u[:, None] - centres) / width) ** 2))).astype(
-            np.float32
-        )
+    def _in_focus(self, amplitudes: np.ndarray, shape: tuple[int, int], step: float) -> np.ndarray:
+        """The field in focus, complex64 (y, x), of amplitudes (m,) on pixels of ``step`` metres, tile by tile: each is
+        the product of the profiles of the modes whose light comes there."""
+        field = np.empty(shape, np.complex64)
+        reach = REACH * float(self.mode_radius.max())
+        y, x = ((np.arange(n) - (n - 1) / 2) * step for n in shape)
+        parts = np.stack([amplitudes.real, amplitudes.imag]) * np.sqrt(2 / np.pi) / self.mode_radius
+        for top in range(0, shape[0], TILE):
+            rows = slice(top, top + TILE)
+            beside = self._within(0, y[rows], reach, np.arange(self.cores))
+            for left in range(0, shape[1], TILE):
+                columns = slice(left, left + TILE)
+                near = self._within(1, x[columns], reach, beside)
+                down, across = (self._profile(u, axis, near) for axis, u in enumerate((y[rows], x[columns])))
+                seen = (parts[:, None, near].astype(np.float32) * down) @ across.T
+                field.real[rows, columns], field.imag[rows, columns] = seen
+        return field
+
+    def _within(self, axis: int, u: np.ndarray, reach: float, of: np.ndarray) -> np.ndarray:
+        """Those of some modes that are within ``reach`` of places along an axis."""
+        centre = self.centres[of, axis]
+        return of[(centre > u[0] - reach) & (centre < u[-1] + reach)]
+
+    def _profile(self, u: np.ndarray, axis: int, modes: np.ndarray) -> np.ndarray:
+        """The modes' Gaussians at places along an axis, float32 (u, modes)."""
+        away = (u[:, None] - self.centres[modes, axis]) / self.mode_radius[modes]
+        return np.exp(-(away**2)).astype(np.float32)
 
 
 def _couplings(

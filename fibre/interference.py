@@ -65,28 +65,32 @@ def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference
     for start in range(0, height, rows):
         own = (..., slice(None), slice(start, start + rows), slice(None))
         parts.append(_solved(images[own], known[own], design, both))
-    product, variance, mean, left = (np.concatenate(part, axis=-2) for part in zip(*parts, strict=True))
+    product, variance, mean = (np.concatenate(part, axis=-2) for part in zip(*parts, strict=True))
     if weights is None:
-        variance = variance * (left.mean() / (count - 3) if count > 3 else np.nan)
+        left = images - mean[..., None, :, :]
+        left = left - np.einsum("j,...yx->...jyx", np.exp(1j * steps), product).real
+        variance = variance * ((left**2).sum(-3).mean() / (count - 3) if count > 3 else np.nan)
     solvable = np.isfinite(mean)
     return Interference(product, np.where(solvable, variance, np.inf), mean)
 
 
 def _solved(images: np.ndarray, weight: np.ndarray, design: np.ndarray, both: np.ndarray) -> list[np.ndarray]:
-    """conj(H) V, its variance for these weights, the mean and the squares left over, of (..., k, y, x).
+    """conj(H) V, its variance for these weights and the mean, of (..., k, y, x).
 
     The normal matrices are inverted by cofactors on whole images: a library call on a million 3 x 3 matrices takes ten
     times as long. NaN where there is no inverse.
     """
-    weighted = weight * images
-    a, b, c, d, e, f = (sum(w * weight[..., j, :, :] for j, w in enumerate(row)) for row in both)
-    first, second, third = (sum(w * weighted[..., j, :, :] for j, w in enumerate(row)) for row in design.T)
+    shape, flat = weight.shape[-2:], (*weight.shape[:-2], -1)
+    normal = (both @ weight.reshape(flat)).reshape(*weight.shape[:-3], 6, *shape)
+    right = (design.T @ (weight * images).reshape(flat)).reshape(*weight.shape[:-3], 3, *shape)
+    a, b, c, d, e, f = np.moveaxis(normal, -3, 0)
+    first, second, third = np.moveaxis(right, -3, 0)
     ca, cb, cc, cd, ce, cf = d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * ca + b * cb + c * cc
     solvable = determinant > 1e-9 * (np.maximum(a + d + f, 1e-300) / 3) ** 3
     over = np.where(solvable, 1 / np.where(solvable, determinant, 1.0), np.nan)
     mean = over * (ca * first + cb * second + cc * third)
-    real = over * (cb * first + cd * second + ce * third)
-    imaginary = over * (cc * first + ce * second + cf * third)
-    left = sum((images[..., j, :, :] - mean - p * real - q * imaginary) ** 2 for j, (_, p, q) in enumerate(design))
-    return [real + 1j * imaginary, over * (cd + cf), mean, np.asarray(left)]
+    product = np.empty(mean.shape, complex)
+    product.real = over * (cb * first + cd * second + ce * third)
+    product.imag = over * (cc * first + ce * second + cf * third)
+    return [product, over * (cd + cf), mean]

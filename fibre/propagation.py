@@ -14,7 +14,7 @@ import numpy as np
 
 from polinfer.checks import complex_array, real_array, real_number
 
-__all__ = ["angular_spectrum", "phase_per_metre", "transfer_function"]
+__all__ = ["angular_spectrum", "defocus_masks", "phase_per_metre", "transfer_function"]
 
 
 def transfer_function(shape: tuple[int, int], distance: Any, wavelength: float, pixel_size: float) -> np.ndarray:
@@ -63,13 +63,28 @@ def phase_per_metre(shape: tuple[int, int], wavelength: float, pixel_size: float
 @lru_cache(maxsize=4)
 def _transfer(shape: tuple[int, int], distances: bytes, wavelength: float, pixel_size: float) -> np.ndarray:
     """The masks of :func:`transfer_function`, kept: a run asks for the same ones at every capture."""
-    distance = np.frombuffer(distances)[:, None, None]
+    masks = _masks(shape, np.frombuffer(distances), wavelength, pixel_size)
+    masks.flags.writeable = False
+    return masks
+
+
+def _masks(shape: tuple[int, int], distances: np.ndarray, wavelength: float, pixel_size: float) -> np.ndarray:
+    distance = distances[:, None, None]
     fy, fx = (np.fft.fftfreq(n, pixel_size) for n in shape)
     turn, inside = phase_per_metre(shape, wavelength, pixel_size)
     phase, axial = distance * turn, turn / (2 * np.pi) + 1 / wavelength
     for f, n in ((fy[:, None], shape[0]), (fx[None, :], shape[1])):
         inside = inside & (np.abs(distance * f) <= axial * n * pixel_size / 2)
-    masks = np.where(inside, np.exp(1j * phase), 0.0)
+    return np.where(inside, np.exp(1j * phase), 0.0)
+
+
+@lru_cache(maxsize=2)
+def defocus_masks(shape: tuple[int, int], distances: bytes, wavelength: float, pixel_size: float) -> np.ndarray:
+    """The masks of :func:`transfer_function` in single precision, complex64 (distance, y, x), kept in that alone;
+    ``distances``: the bytes of float64 metres."""
+    masks = np.empty((len(distances) // 8, *shape), np.complex64)
+    for i, distance in enumerate(np.frombuffer(distances)):
+        masks[i] = _masks(shape, np.array([distance]), wavelength, pixel_size)[0]
     masks.flags.writeable = False
     return masks
 

@@ -237,6 +237,16 @@ def test_a_defocused_image_is_the_propagated_focus_image(oversampling):
         assert np.linalg.norm(found[z] - expected) < 1e-5 * np.linalg.norm(expected)
 
 
+def test_the_image_in_focus_is_the_sum_of_all_modes_everywhere():
+    rng = np.random.default_rng(4)
+    c = rng.standard_normal((2, M)) + 1j * rng.standard_normal((2, M))
+    shape, pixel = (150, 97), 0.4e-6  # several tiles, the last ones narrower, light beyond the frame
+    y, x = (((np.arange(n) - (n - 1) / 2) * pixel)[:, None] - BUNDLE.centres[:, i] for i, n in enumerate(shape))
+    w = BUNDLE.mode_radius
+    dense = np.einsum("yk,xk,pk->pyx", np.exp(-((y / w) ** 2)), np.exp(-((x / w) ** 2)), c * np.sqrt(2 / np.pi) / w)
+    np.testing.assert_allclose(BUNDLE.image(c, shape, pixel), dense, atol=1e-6 * np.abs(dense).max())
+
+
 def test_the_image_is_linear_and_batches_are_single_images():
     c = random_amplitudes(2, 3)
     image = BUNDLE.image(c, (40, 44), 0.9e-6, [0.0, 2e-5])

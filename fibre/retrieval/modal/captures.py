@@ -7,23 +7,15 @@ In: the images of one capture, what is found of H. Out: amplitudes of V with the
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 
 from fibre.interference import relative_phase
-from fibre.propagation import transfer_function
 from fibre.retrieval.modal.views import Views, apply, coarse_images, coarse_variance
 
-__all__ = ["defocus_masks", "second_polarisation"]
+__all__ = ["second_polarisation"]
 
 TOLERANCE, MOST = 1e-5, 40  # of the conjugate gradients: neighbours overlap by a few per cent, a dozen steps are exact
-
-
-@lru_cache(maxsize=2)
-def defocus_masks(shape: tuple[int, int], distances: bytes, wavelength: float, pixel_size: float) -> np.ndarray:
-    """Masks of a defocus, complex64 (image, y, x); ``distances``: the bytes of float64 metres."""
-    return transfer_function(shape, np.frombuffer(distances), wavelength, pixel_size).astype(np.complex64)
 
 
 def second_polarisation(

@@ -13,11 +13,11 @@ import scipy.fft
 import scipy.sparse.linalg
 import scipy.spatial
 
-from fibre.propagation import phase_per_metre
+from fibre.propagation import defocus_masks, phase_per_metre
 from fibre.records import Fibrelets, Images, RetrievalStatus
 from fibre.retrieval.base import Amplitudes, ModeMethod, Solution, Stack
 from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
-from fibre.retrieval.modal.captures import defocus_masks, second_polarisation
+from fibre.retrieval.modal.captures import second_polarisation
 from fibre.retrieval.modal.newton import Coupling, Found, Problem, make_coupling, refine
 from fibre.retrieval.modal.start import Neighbours, make_neighbours, spreads, synchronise
 from fibre.retrieval.modal.views import Views, coarse_images, coarse_variance, make_views
