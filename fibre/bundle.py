@@ -257,7 +257,9 @@ class Bundle:
         oversampling, padding = integer("oversampling", oversampling, low=1), integer("padding", padding, low=1)
         step = real_number("pixel_size", pixel_size, above=0) / oversampling
         inner = (shape[0] * oversampling, shape[1] * oversampling)
-        outer = (inner[0] * padding, inner[1] * padding)
+        # as many pixels on either side of the frame
+        height, width = (n * padding + n * (padding - 1) % 2 for n in inner)
+        outer = (height, width)
         rows, columns = (slice((o - i) // 2, (o - i) // 2 + i) for o, i in zip(outer, inner, strict=True))
         masks = defocus_masks(outer, distances.tobytes(), self.wavelength, step)
         batch = amplitudes.reshape(-1, self.cores).astype(np.complex64)
