@@ -19,8 +19,10 @@ import scipy.spatial
 from fibre.records import Fibrelets
 from polinfer.checks import complex_array, real_array, real_number
 
-__all__ = ["ModeBasis", "find_fibrelets", "lattice_pitch", "locate_fibrelets", "mode_matrix", "reference_region"]
+__all__ = ["LocalPower", "ModeBasis", "find_fibrelets", "lattice_pitch", "locate_fibrelets", "mode_matrix",
+           "reference_region"]  # fmt: skip
 
+BESIDE = 1.6  # pitches: fibrelets whose light is taken to be about as strong
 REFERENCE = 0.03  # of the strongest: fibrelets with more of the reference spot's power belong to it
 
 
@@ -212,13 +214,39 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     return scipy.sparse.csr_array((values[inside], (row, mode[inside])), shape=(shape[0] * shape[1], len(pixel)))
 
 
+class LocalPower:
+    r"""The power that a mode may carry, from an image of the power, as the prior of its amplitude.
+
+    For every mode the matched filter :math:`\sum_x w\,g_k^2 I / \sum_x w\,g_k^4`, with its standard error, averaged
+    over the mode and its neighbours: what lights a fibrelet lights those beside it, and their fields interfere.
+
+    ``squares``: of the modes, sparse (m, y x). ``centres`` (m, 2), metres.
+    """
+
+    def __init__(self, squares: scipy.sparse.csr_array, centres: np.ndarray) -> None:
+        self._squares, self._fourths = squares, squares.power(2)
+        near = BESIDE * lattice_pitch(centres) if len(centres) > 1 else 1.0
+        i, j = scipy.spatial.cKDTree(centres).query_pairs(near, output_type="ndarray").T
+        each = np.arange(len(centres))
+        pairs = np.r_[i, j, each], np.r_[j, i, each]
+        beside = scipy.sparse.csr_array((np.ones(len(pairs[0])), pairs))
+        self._mean = scipy.sparse.diags_array(1 / beside.sum(axis=1)) @ beside
+
+    def __call__(self, power: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:
+        """(m,), at most ``most``, from an image of the power (y, x) and its inverse variances, 0 where unusable."""
+        known = weight.ravel().astype(float)
+        strength = np.maximum(self._fourths @ known, 1e-300)
+        seen = self._squares @ (known * np.where(known > 0, power.ravel(), 0)) / strength
+        return np.minimum(self._mean @ (np.maximum(seen, 0) + 2 / np.sqrt(strength)), most)
+
+
 class ModeBasis:
     """The modes of a frame (:func:`mode_matrix`), ready for weighted least squares of many fields."""
 
     def __init__(self, modes: scipy.sparse.csr_array) -> None:
         self.modes = modes
         self.transposed = scipy.sparse.csr_array(modes.T)
-        self._squares = self.transposed.power(2)
+        self.squares = self.transposed.power(2)
 
     @cached_property
     def _gram(self) -> scipy.sparse.csr_array:
@@ -232,22 +260,22 @@ class ModeBasis:
         weighted = scipy.sparse.csr_array((rows.data * weight[rows.indices], rows.indices, rows.indptr), rows.shape)
         return scipy.sparse.csr_array(weighted @ self.modes)
 
-    def amplitudes(self, field: Any, variance: Any, prior_power: float) -> tuple[np.ndarray, np.ndarray]:
+    def amplitudes(self, field: Any, variance: Any, prior_power: Any) -> tuple[np.ndarray, np.ndarray]:
         r"""Amplitudes c of the modes G in one field by weighted least squares with a weak prior.
 
         .. math:: \min_c \sum_x |E(x) - (G c)(x)|^2 / \mathrm{var}(x) + |c|^2 / P
 
         ``field`` complex (y, x); ``variance`` real (y, x), infinite where the field says nothing; ``prior_power`` P,
-        what a mode may carry: where there is no light at all the amplitude is 0 with variance P. Returns complex (m,)
-        and the variance (m,): one over the diagonal of the normal matrix, which neighbours that overlap by a few per
-        cent leave right to the square of that.
+        what a mode may carry, one number or (m,): where the field says nothing the amplitude is 0 with variance P.
+        Returns complex (m,) and the variance (m,): one over the diagonal of the normal matrix, which neighbours that
+        overlap by a few per cent leave right to the square of that.
         """
         field = complex_array("field", field, shape=(None, None))
         variance = real_array("variance", variance, shape=field.shape, above=0)
         usable = np.isfinite(variance)
         weight = np.where(usable, 1 / variance, 0).ravel()
         known = weight * np.where(usable, field, 0).ravel()
-        diagonal = self._squares @ weight + 1 / prior_power
+        diagonal = self.squares @ weight + 1 / prior_power
         # scaled to a diagonal of ones; neighbours overlap by a few per cent, so that a dozen steps are exact
         scale = scipy.sparse.diags_array(1 / np.sqrt(diagonal))
         normal = scale @ self._normal(weight) @ scale

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from fibre.calibration import positions_on_camera
 from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
 from fibre.drift import Drift, track_drift
-from fibre.fibrelets import ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
+from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
 from fibre.interference import relative_phase
 from fibre.records import (
     Calibration,
@@ -352,7 +352,8 @@ class _Run:
         """Of all captures, with the drift taken out; those that are in the folder are not retrieved again."""
         basis = None
         if not self._in_modes():
-            basis = ModeBasis(mode_matrix(self.fibrelets, images.frame, images.pixel_size))
+            modes = ModeBasis(mode_matrix(self.fibrelets, images.frame, images.pixel_size))
+            basis = modes, LocalPower(modes.squares, self.fibrelets.centres)
         kept = None if self.folder is None else self._kept(images, name)
         done = []
         with tqdm(total=images.captures, desc=f"fields of {name}", unit="capture", disable=not self.progress) as bar:
@@ -406,12 +407,13 @@ class _Run:
         theirs, ours = self.method.fibrelets, self.fibrelets
         return np.array_equal(theirs.centres, ours.centres) and np.array_equal(theirs.mode_radius, ours.mode_radius)
 
-    def _batch(self, images: Images, part: range, basis: ModeBasis | None) -> _Amplitudes:
-        """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones; ``basis`` where
+    def _batch(self, images: Images, part: range, given: tuple[ModeBasis, LocalPower] | None) -> _Amplitudes:
+        """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones; ``given`` where
         the method makes fields on the camera's pixels."""
-        if basis is None:
+        if given is None:
             assert isinstance(self.method, ModeMethod)
             return _Amplitudes(*self.method.amplitudes(images, part))
+        basis, local = given
         planes = len(images.diversity)
         # all of one capture before the next: a lazy stack makes its three parts together
         read = [(images.radiance[c], images.variance[c], images.saturated[c]) for c in part]
@@ -433,7 +435,9 @@ class _Run:
                 v = fringes.product[i] / np.conj(h)
                 v_variance = fringes.variance[i] / intensity
             v_variance = np.where(np.isfinite(v) & np.isfinite(v_variance), v_variance, np.inf)
-            values[i, 1], variance[i, 1] = basis.amplitudes(v, v_variance, power)
+            known = np.where(np.isfinite(fringes.variance[i]), 1 / fringes.variance[i], 0)
+            light = 2 * fringes.mean[i] - intensity  # |V|^2
+            values[i, 1], variance[i, 1] = basis.amplitudes(v, v_variance, local(light, known, power))
             # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
             ratio = np.abs(values[i, 1]) ** 2 / (np.abs(values[i, 0]) ** 2 + variance[i, 0])
             variance[i, 1] += ratio * variance[i, 0]

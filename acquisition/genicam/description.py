@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
 import defusedxml.ElementTree
@@ -15,7 +14,7 @@ from defusedxml.common import DefusedXmlException
 
 from acquisition.errors import ProtocolError
 
-__all__ = ["LARGEST", "VALUE_NODES", "WHOLE", "every", "first", "integer_of", "local", "number_of", "read_nodes"]
+__all__ = ["LARGEST", "VALUE_NODES", "WHOLE", "every", "first", "integer_of", "number_of", "read_nodes"]
 
 LARGEST = 16 << 20  # bytes of XML
 MOST = 50_000  # nodes
@@ -34,15 +33,17 @@ def read_nodes(xml: bytes) -> dict[str, Element]:
         root = defusedxml.ElementTree.fromstring(xml, forbid_dtd=True)
     except (ParseError, DefusedXmlException, ValueError, LookupError, RecursionError) as error:
         raise ProtocolError(f"the camera's XML cannot be read: {type(error).__name__} {error}.") from error
-    if local(root.tag) != "RegisterDescription":
-        raise ProtocolError(f"the camera's XML begins with {local(root.tag)[:40]!r}, not RegisterDescription.")
+    for element in root.iter():
+        element.tag = str(element.tag).rsplit("}", 1)[-1]  # without its namespace
+    if root.tag != "RegisterDescription":
+        raise ProtocolError(f"the camera's XML begins with {root.tag[:40]!r}, not RegisterDescription.")
     found: dict[str, Element] = {}
     stack = list(root)[::-1]
     while stack:
         node = stack.pop()
-        if local(node.tag) == "Group":
+        if node.tag == "Group":
             stack.extend(list(node)[::-1])
-        if local(node.tag) not in VALUE_NODES | {"Category", "Port"}:
+        if node.tag not in VALUE_NODES | {"Category", "Port"}:
             continue
         name = node.get("Name", "")
         if not name or name in found:
@@ -53,21 +54,16 @@ def read_nodes(xml: bytes) -> dict[str, Element]:
     return found
 
 
-def local(tag: Any) -> str:
-    """A tag without its namespace."""
-    return str(tag).rsplit("}", 1)[-1]
-
-
 def every(node: Element, tag: str) -> Iterator[str]:
     """What the children of this tag hold."""
-    for child in node:
-        if local(child.tag) == tag:
-            yield (child.text or "").strip()
+    for child in node.findall(tag):
+        yield (child.text or "").strip()
 
 
 def first(node: Element, tag: str) -> str | None:
     """What the first child of this tag holds; None without one."""
-    return next(every(node, tag), None)
+    child = node.find(tag)
+    return None if child is None else (child.text or "").strip()
 
 
 def integer_of(text: str) -> int:

@@ -18,7 +18,7 @@ from typing import Any
 from xml.etree.ElementTree import Element
 
 from acquisition.errors import ProtocolError, SettingError
-from acquisition.genicam.description import VALUE_NODES, WHOLE, every, first, integer_of, local, number_of, read_nodes
+from acquisition.genicam.description import VALUE_NODES, WHOLE, every, first, integer_of, number_of, read_nodes
 from acquisition.genicam.formula import Formula, Number
 from acquisition.genicam.registers import Port, Registers
 
@@ -57,7 +57,7 @@ class Features:
         self._registers = Registers(lambda: self.port, self._number, self._variables)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.nodes and local(self.nodes[name].tag) in VALUE_NODES
+        return name in self.nodes and self.nodes[name].tag in VALUE_NODES
 
     def names(self) -> list[str]:
         """Features that the categories show, from Root downwards, in order; all values where there is no Root."""
@@ -70,7 +70,7 @@ class Features:
             if name in seen or name not in self.nodes:
                 continue
             seen.add(name)
-            if local(self.nodes[name].tag) == "Category":
+            if self.nodes[name].tag == "Category":
                 stack.extend(list(every(self.nodes[name], "pFeature"))[::-1])
             else:
                 found[name] = None
@@ -79,7 +79,7 @@ class Features:
     def feature(self, name: str) -> Feature:
         """Kind, unit, limits, choices and access as they are now."""
         node = self._node(name)
-        tag = local(node.tag)
+        tag = node.tag
         kind = {"Boolean": "switch", "Enumeration": "choice", "Command": "action", "StringReg": "text",
                 "Register": "bytes"}.get(tag, "integer" if tag in WHOLE else "number")  # fmt: skip
         low, high, step = self.limits(name) if kind in ("integer", "number") else (None, None, None)
@@ -108,7 +108,7 @@ class Features:
         return access == "rw" or access == {"r": "ro", "w": "wo"}[what]
 
     def _access_below(self, node: Element) -> str:
-        tag = local(node.tag)
+        tag = node.tag
         if tag in ("SwissKnife", "IntSwissKnife"):
             return "ro"
         if tag in ("IntReg", "MaskedIntReg", "FloatReg", "StringReg", "Register"):
@@ -121,7 +121,7 @@ class Features:
         node = self._node(name)
         if not self._allows(self.access(name), "r"):
             raise SettingError(f"{name} cannot be read now.")
-        tag = local(node.tag)
+        tag = node.tag
         if tag == "Boolean":
             return self._number(name) == self._on_off(node)[0]
         if tag == "Enumeration":
@@ -142,7 +142,7 @@ class Features:
         node = self._node(name)
         if not self._allows(self.access(name), "w"):
             raise SettingError(f"{name} cannot be written now (read-only, locked or not available).")
-        tag = local(node.tag)
+        tag = node.tag
         if tag == "Boolean":
             self._put(name, self._on_off(node)[0 if value else 1])
         elif tag == "Enumeration":
@@ -177,7 +177,7 @@ class Features:
     def execute(self, name: str) -> None:
         """Do what a command stands for."""
         node = self._node(name)
-        if local(node.tag) != "Command":
+        if node.tag != "Command":
             raise SettingError(f"{name} is no command.")
         if not self._allows(self.access(name), "w"):
             raise SettingError(f"{name} cannot be executed now.")
@@ -195,7 +195,7 @@ class Features:
         """Smallest and largest value and increment, None where there is none."""
         with _Deeper(self):
             node = self._node(name)
-            tag = local(node.tag)
+            tag = node.tag
             whole = tag in WHOLE
             bounds = [self._bound(node, part, whole) for part in ("Min", "Max", "Inc")]
             if tag in ("IntReg", "MaskedIntReg"):
@@ -256,7 +256,7 @@ class Features:
     def _entries(self, node: Element, everything: bool = False) -> dict[str, int]:
         found = {}
         for child in node:
-            if local(child.tag) != "EnumEntry":
+            if child.tag != "EnumEntry":
                 continue
             conditions = [first(child, tag) for tag in ("pIsImplemented", "pIsAvailable")]
             if not everything and any(c is not None and not self._number(c) for c in conditions):
@@ -270,7 +270,7 @@ class Features:
         """The number behind any node."""
         with _Deeper(self):
             node = self._referred(name)
-            tag = local(node.tag)
+            tag = node.tag
             if tag in ("IntReg", "MaskedIntReg"):
                 return self._registers.value(node)
             if tag == "FloatReg":
@@ -295,9 +295,9 @@ class Features:
         if index is not None:
             chosen = int(self._number(index))
             for child in node:
-                if local(child.tag) in ("ValueIndexed", "pValueIndexed") and child.get("Index", "") == str(chosen):
+                if child.tag in ("ValueIndexed", "pValueIndexed") and child.get("Index", "") == str(chosen):
                     text = (child.text or "").strip()
-                    if local(child.tag) == "pValueIndexed":
+                    if child.tag == "pValueIndexed":
                         return self._number(text)
                     return number_of(text) if tag == "Float" else integer_of(text)
             other, own = first(node, "pValueDefault"), first(node, "ValueDefault")
@@ -315,7 +315,7 @@ class Features:
         """Write the number behind any node."""
         with _Deeper(self):
             node = self._referred(name)
-            tag = local(node.tag)
+            tag = node.tag
             if tag in ("IntReg", "MaskedIntReg"):
                 self._registers.put(node, int(value))
             elif tag == "FloatReg":
@@ -324,7 +324,7 @@ class Features:
             elif tag in ("Converter", "IntConverter"):
                 found = self._formula(name, node, "FormulaTo")(self._variables(node) | {"FROM": value})
                 below = self._below(node)
-                whole = local(self._referred(below).tag) in WHOLE
+                whole = self._referred(below).tag in WHOLE
                 self._put(below, round(found) if whole else found)
             elif tag in ("SwissKnife", "IntSwissKnife", "StringReg", "Register", "Category", "Port"):
                 raise ProtocolError(f"the camera's XML writes a number to {name[:80]!r}, a {tag}.")
@@ -333,7 +333,7 @@ class Features:
                 for copy in every(node, "pValueCopy"):
                     self._put(copy, value)
             elif first(node, "Value") is not None:
-                element = next(child for child in node if local(child.tag) == "Value")
+                element = next(child for child in node if child.tag == "Value")
                 element.text = repr(value)
             else:
                 raise SettingError(f"{name} cannot be written.")
@@ -350,10 +350,10 @@ class Features:
             text = first(node, tag)
             if text is None:
                 raise ProtocolError(f"the camera's XML gives {name[:80]!r} no {tag}.")
-            whole = local(node.tag) in ("IntSwissKnife", "IntConverter")
+            whole = node.tag in ("IntSwissKnife", "IntConverter")
             named = {}
             for child in node:
-                if local(child.tag) == "Expression":
+                if child.tag == "Expression":
                     named[child.get("Name", "")] = Formula((child.text or "").strip(), whole)
             formula = Formula(text, whole)
             if named:
@@ -365,9 +365,9 @@ class Features:
         found: dict[str, Number] = {}
         for child in node:
             text = (child.text or "").strip()
-            if local(child.tag) == "pVariable":
+            if child.tag == "pVariable":
                 found[child.get("Name", "")] = self._number(text)
-            elif local(child.tag) == "Constant":
+            elif child.tag == "Constant":
                 found[child.get("Name", "")] = number_of(text)
         return found
 

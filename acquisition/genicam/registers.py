@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from xml.etree.ElementTree import Element
 
 from acquisition.errors import DeviceRefused, ProtocolError, SettingError
-from acquisition.genicam.description import every, first, integer_of, local
+from acquisition.genicam.description import every, first, integer_of
 from acquisition.genicam.formula import Formula, Number
 
 __all__ = ["Port", "Registers"]
@@ -64,14 +64,14 @@ class Registers:
         address = sum(integer_of(found) for found in every(node, "Address"))
         address += sum(int(self._number(name)) for name in every(node, "pAddress"))
         for child in node:
-            if local(child.tag) == "pIndex":
+            if child.tag == "pIndex":
                 offset = child.get("Offset")
                 step = integer_of(offset) if offset is not None else self.length(node)
                 other = child.get("pOffset")
                 if other is not None:
                     step = int(self._number(other))
                 address += step * int(self._number((child.text or "").strip()))
-            elif local(child.tag) == "IntSwissKnife":
+            elif child.tag == "IntSwissKnife":
                 formula = Formula(first(child, "Formula") or "", whole=True)
                 address += int(formula(self._variables(child)))
         if not 0 <= address < 1 << 64:
@@ -95,7 +95,7 @@ class Registers:
         total = 8 * self.length(node)
         if total > 64:
             raise ProtocolError(f"{node.get('Name', '')[:80]!r} is a whole number of {total} bits.")
-        if local(node.tag) == "IntReg":
+        if node.tag == "IntReg":
             return 0, total
         bit = first(node, "Bit")
         ends = [integer_of(bit or first(node, tag) or "0") for tag in ("LSB", "MSB")]

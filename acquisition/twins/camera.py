@@ -130,13 +130,12 @@ class CameraTwin(UsbModel):
     # registers
 
     def _put(self, address: int, data: bytes) -> None:
-        for i, byte in enumerate(data):
-            self.memory[address + i] = byte
+        self.memory.update(zip(range(address, address + len(data)), data, strict=True))
 
     def _get(self, address: int, count: int) -> bytes:
         if XML <= address < XML + len(self._xml):
             return self._xml[address - XML : address - XML + count]
-        return bytes(self.memory[address + i] for i in range(count))
+        return bytes(map(self.memory.__getitem__, range(address, address + count)))
 
     def register(self, name: str) -> int:
         """A register of the features, by its name here."""

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fibre.fibrelets import LocalPower
 from fibre.interference import relative_phase
-from fibre.retrieval.modal.views import Views, apply, coarse_images, coarse_variance
+from fibre.retrieval.modal.views import Views, apply, coarse_images, coarse_variance, squared
 
 __all__ = ["second_polarisation"]
 
@@ -19,17 +20,24 @@ TOLERANCE, MOST = 1e-5, 40  # of the conjugate gradients: neighbours overlap by 
 
 
 def second_polarisation(
-    views: Views, h: np.ndarray, h_variance: float, fringes: np.ndarray, noise: np.ndarray, steps: np.ndarray
+    views: Views,
+    local: LocalPower,
+    h: np.ndarray,
+    h_variance: float,
+    fringes: np.ndarray,
+    noise: np.ndarray,
+    steps: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""Amplitudes v of V, complex (m,), and their variance, from images in which H and V interfere.
 
-    .. math:: \min_v \sum_x \frac{|p(x) - H^*(x) (G v)(x)|^2}{\mathrm{var}\,p(x)} + |v|^2 / P
+    .. math:: \min_v \sum_x \frac{|p(x) - H^*(x) (G v)(x)|^2}{\mathrm{var}\,p(x)} + \sum_k |v_k|^2 / P_k
 
-    with p the measured conj(H) V (:func:`fibre.relative_phase`), H = G h that of the modes found, and P all power of H,
-    or of its noise: where there is no light the amplitude is 0 with variance P.
+    with p the measured conj(H) V (:func:`fibre.relative_phase`), H = G h that of the modes found, and P the power of V
+    around each mode: the mean over the phase steps holds |V|^2, so that a V whose H is dark is known to be as weak as
+    it looks. Where the images say nothing at all, P is all power of H, or of its noise.
 
-    ``h`` (m,) and its variance; ``fringes`` and ``noise``, their variances, infinite where unusable: (k, y, x) on the
-    camera's pixels; ``steps`` (k,) radians.
+    ``local``: of the views' modes. ``h`` (m,) and its variance; ``fringes`` and ``noise``, their variances, infinite
+    where unusable: (k, y, x) on the camera's pixels; ``steps`` (k,) radians.
     """
     images, spread = coarse_images(fringes, views.step), coarse_variance(noise, views.step)
     with np.errstate(divide="ignore"):
@@ -37,11 +45,12 @@ def second_polarisation(
     field = views.focus(h)
     usable = np.isfinite(found.product) & np.isfinite(found.variance)
     weight = np.where(usable, 1 / np.where(usable, found.variance, 1), 0).astype(np.float32)
-    strength = (weight * (field.real**2 + field.imag**2)).ravel()
+    strength = (weight * squared(field)).ravel()
     right = (weight * field * np.where(usable, found.product, 0)).astype(np.complex64).ravel()
     # of a dark H at least what its noise would be
-    power = max(float((np.abs(h) ** 2).sum()), len(h) * h_variance)
-    ridge = np.float32(1 / power)
+    most = max(float((np.abs(h) ** 2).sum()), len(h) * h_variance)
+    light = 2 * found.mean - squared(field)  # |V|^2
+    ridge = (1 / local(light, weight, most)).astype(np.float32)
     diagonal = views.squares @ strength + ridge
     scale = 1 / np.sqrt(diagonal)
 

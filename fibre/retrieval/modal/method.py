@@ -13,6 +13,7 @@ import scipy.fft
 import scipy.sparse.linalg
 import scipy.spatial
 
+from fibre.fibrelets import LocalPower
 from fibre.propagation import defocus_masks, phase_per_metre
 from fibre.records import Fibrelets, Images, RetrievalStatus
 from fibre.retrieval.base import Amplitudes, ModeMethod, Solution, Stack
@@ -131,8 +132,9 @@ class Modal(ModeMethod):
                 # a coarse pixel is the mean of step^2 of the camera's, and modes are of unit power over those
                 floor *= geometry.views.step**2
                 second, variance = second_polarisation(
-                    geometry.views, found.amplitudes, floor, radiance[planes:], noise[planes:], images.steps
-                )
+                    geometry.views, geometry.local, found.amplitudes, floor, radiance[planes:], noise[planes:],
+                    images.steps,
+                )  # fmt: skip
             status = 0 if self._converged(found) else int(RetrievalStatus.NOT_CONVERGED)
             status |= int(RetrievalStatus.MISFIT) if misfitted else 0
             both = np.stack([found.amplitudes, second]), np.stack([np.full(variance.shape, floor), variance])
@@ -194,6 +196,7 @@ class Geometry(NamedTuple):
     neighbours: Neighbours | None
     gram: scipy.sparse.linalg.SuperLU
     turn: np.ndarray
+    local: LocalPower
 
 
 class _Key:
@@ -229,7 +232,8 @@ def _made(key: _Key) -> Geometry:
     gram = scipy.sparse.linalg.splu((camera.transposed @ camera.modes).tocsc().astype(float))
     turn, _ = phase_per_metre(views.masks.shape[-2:], wavelength, views.pixel_size)
     return Geometry(views, camera, make_coupling(tree, views, radii),
-                    make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn.astype(np.float32))  # fmt: skip
+                    make_neighbours(fibrelets, views, fields, radii, pixel), gram, turn.astype(np.float32),
+                    LocalPower(views.squares, fibrelets.centres))  # fmt: skip
 
 
 def _judged(found: Found, images: np.ndarray, spread: np.ndarray) -> tuple[float, bool]:
