@@ -28,6 +28,7 @@ __all__ = [
     "profile_of_patterns",
     "response_covariance",
     "spot_spacing",
+    "unmeasured",
     "usual_response",
 ]
 
@@ -260,6 +261,27 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         weight = 1 / fields.variance[:, :, cores].transpose(1, 2, 0)
         systems = (scaled * weight[:, :, None]) @ scaled.conj().swapaxes(-1, -2) + np.eye(root.shape[1])
         yield _Regressions(cores, chosen, root, scaled, weight, systems)
+
+
+def unmeasured(fields: CalibrationFields) -> np.ndarray:
+    r"""Power on each fibrelet, (m,), of light that enters where no spot was, as bright as the spots' own.
+
+    The facet has more fibrelets than points where the points are far apart: with n fibrelets to a point, light has n
+    dimensions there and the calibration has seen one. What comes of the others is known on average,
+
+    .. math:: (1 - 1/n) \sum_l \tau^2(|r_k - r_l|)
+
+    over all fibrelets l, with the :func:`coupling_profile`. 0 where points are as dense as fibrelets.
+    """
+    centres, positions = fields.fibrelets.centres, positions_on_camera(fields)
+    if len(positions) < 2:
+        return np.zeros(len(centres))
+    tree, profile = scipy.spatial.cKDTree(centres), coupling_profile(fields)
+    # circles as large as the square cell of a point
+    around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
+    share = max(0.0, 1 - 1 / max(float(around.mean()), 1.0))
+    pairs = tree.sparse_distance_matrix(tree, profile.reach(FAINT), output_type="coo_matrix")
+    return share * np.bincount(pairs.row, profile(pairs.data), len(centres))
 
 
 def columns(fields: CalibrationFields, fraction: float = FAINT, chunk: int = 128) -> Columns:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from fibre.calibration import columns
+from fibre.calibration import columns, unmeasured
 from fibre.records import CalibrationFields
 from fibre.recovery.base import RowByRow
 from polinfer.checks import real_number
@@ -18,7 +18,7 @@ __all__ = ["ForwardInverse"]
 
 
 class _Known(NamedTuple):
-    """The columns, rows first, and the noise of each mode's row of A summed over all inputs (2 m,)."""
+    """The columns, rows first, and what is not known of each mode's row of A, summed over all inputs (2 m,)."""
 
     values: scipy.sparse.csr_array
     ridge: np.ndarray
@@ -32,10 +32,13 @@ class ForwardInverse(RowByRow):
     (:func:`fibre.calibration.columns`), then, for the fibrelets in a window around a point,
 
     .. math:: a = \arg\min \; \| e - a \hat A \|^2 + \sum_k |a_k|^2 \Lambda_k, \quad
-              \Lambda_k = \sum_j \mathrm{var}(\hat A_{kj})
+              \Lambda_k = \sum_j \mathrm{var}(\hat A_{kj}) + \beta L_k
 
-    which is the expectation of :math:`\|e - a A\|^2` over the true A given the measured fields. So the
-    regularisation is set by the noise and not by hand; ``strength`` multiplies it.
+    which is the expectation of :math:`\|e - a A\|^2` over the true A given the measured fields, for light at the points
+    and between them: L is what light where no spot was puts on a fibrelet (:func:`fibre.calibration.unmeasured`), and
+    :math:`\beta` how bright it is there against the points. Without it a row may use fibrelets that the points hardly
+    light, as long as the calibration's noise is small, and a real sample lights those too. So the regularisation is set
+    by the noise and the lattice, not by hand; ``strength`` multiplies the first.
 
     Parameters
     ----------
@@ -46,15 +49,18 @@ class ForwardInverse(RowByRow):
 
     window: float = 27e-6
     strength: float = 1.0
+    between: float = 0.1
 
     def __post_init__(self) -> None:
         real_number("window", self.window, above=0)
         real_number("strength", self.strength, low=0)
+        real_number("between", self.between, low=0)
 
     def prepared(self, fields: CalibrationFields) -> _Known:
         """See :meth:`RowByRow.prepared`."""
         known = columns(fields)
-        return _Known(known.values, self.strength * np.asarray(known.variance.sum(axis=1)).ravel())
+        noise = np.asarray(known.variance.sum(axis=1)).ravel()
+        return _Known(known.values, self.strength * noise + self.between * np.tile(unmeasured(fields), 2))
 
     def usable(self, prepared: _Known) -> np.ndarray:
         """Those with columns."""

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fibre.calibration import clean_fibrelets, columns, coupling_profile, positions_on_camera, response_covariance
+from fibre.calibration import (
+    clean_fibrelets,
+    columns,
+    coupling_profile,
+    positions_on_camera,
+    response_covariance,
+    unmeasured,
+)
 from tests.fibre.scenes import complex_noise, scene, without_noise
 
 NOISE = 0.01
@@ -146,6 +153,27 @@ def test_spots_far_apart_have_the_same_coupling_profile(standard):
     # nine spots against sixty-four: their mean power in a bin scatters
     np.testing.assert_allclose(np.log(profile(at)), np.log(near(at)), atol=0.5)
     assert profile.reach(1e-3) < 20e-6
+
+
+def test_what_light_between_the_points_puts_on_fibrelets_is_the_sum_of_the_profile_over_the_facet(standard):
+    sparse = scene(grid=(6, 6), pitch=7.6e-6, radius=34e-6, reference=(0.0, 31e-6)).calibration(1e-3, 1)
+    profile, centres = coupling_profile(sparse), sparse.fibrelets.centres
+    apart = np.hypot(*np.moveaxis(centres[:, None] - centres, -1, 0))
+    near = apart <= profile.reach(1e-5)
+    total = np.where(near, profile(apart), 0).sum(1)
+    away = np.hypot(*np.moveaxis(sparse.points[:, None] - centres, -1, 0))
+    cell = np.count_nonzero(away < 7.6e-6 / np.sqrt(np.pi)) / 36
+    assert cell == pytest.approx(7.6**2 / (np.sqrt(3) / 2 * 4.5**2), rel=0.1)
+    np.testing.assert_allclose(unmeasured(sparse), (1 - 1 / cell) * total, rtol=1e-6)
+    # a fibrelet to a point: all is measured
+    assert np.max(unmeasured(standard.calibration(1e-3, 0))) < 0.05 * total.max()
+    assert np.all(unmeasured(one_point(standard)) == 0)
+
+
+def one_point(standard):
+    fields = standard.calibration(1e-3, 0)
+    inputs = fields.inputs.tocsr()[[0, 64]]
+    return replace(fields, points=fields.points[:1], inputs=inputs, grid=(1, 1))
 
 
 def test_the_registration_maps_points_to_the_camera(standard):

@@ -9,7 +9,7 @@ import scipy.spatial
 import skimage.io
 
 from fibre import Bundle, Fibrelets, find_fibrelets
-from fibre.fibrelets import ModeBasis, locate_fibrelets, mode_matrix
+from fibre.fibrelets import LocalPower, ModeBasis, locate_fibrelets, mode_matrix
 from polinfer import datasets
 
 PIXEL, SHAPE = 0.5e-6, (140, 150)
@@ -231,6 +231,23 @@ def test_modes_are_those_of_the_bundles_image(bundle):
 def small():
     centres = np.array([[0, 0], [4.4, 0.3], [0.2, 4.6], [-4.1, 2.2], [2.3, -4.5]]) * 1e-6
     return mode_matrix(Fibrelets(centres, 1.6e-6), (30, 32), PIXEL)
+
+
+def test_the_power_around_a_mode_is_the_mean_of_its_own_and_its_neighbours(bundle):
+    frame, pixel, w = (150, 150), 0.5e-6, 1.6e-6
+    centres = np.stack([np.zeros(7), (np.arange(7) - 3) * 9e-6], 1)  # a row, too far apart to overlap
+    modes = mode_matrix(Fibrelets(centres, w), frame, pixel)
+    power = np.array([0, 0, 1e4, 0, 0, 0, 0.0])
+    squares = modes.T.tocsr().power(2)
+    noise = np.random.default_rng(0).standard_normal(frame)
+    found = LocalPower(squares, centres)((squares.T @ power).reshape(frame) + noise, np.ones(frame), 1e6)
+    own = 1 / np.sqrt(squares.power(2).sum(1))  # standard error of a mode's power
+    np.testing.assert_allclose(found[1:4], [1e4 / 3] * 3, rtol=0.02)
+    assert np.all(found[4:] > own[4:])
+    assert np.all(found[4:] < 4 * own[4:])
+    assert np.all(found[:1] < 4 * own[:1])
+    nothing = LocalPower(squares, centres)(np.full(frame, np.nan), np.zeros(frame), 123.0)
+    np.testing.assert_array_equal(nothing, 123.0)
 
 
 def test_amplitudes_are_dense_weighted_least_squares():

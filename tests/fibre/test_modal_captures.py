@@ -4,8 +4,9 @@ stated."""
 import numpy as np
 import pytest
 
-from fibre import Bundle, Defocus, Fibrelets, Images, Modal, RetrievalStatus, relative_phase, retrieve
+from fibre import Bundle, Defocus, Fibrelets, GerchbergSaxton, Images, Modal, RetrievalStatus, relative_phase, retrieve
 from fibre.fibrelets import ModeBasis, mode_matrix
+from fibre.fields import _Run
 
 BUNDLE = Bundle.hexagonal(radius=26e-6, rng=0)
 FIBRELETS = Fibrelets(BUNDLE.centres, BUNDLE.mode_radius)
@@ -13,10 +14,11 @@ PIXEL, FRAME = 0.39e-6, (192, 192)
 NEAR, STEPS = np.linspace(-25e-6, 25e-6, 7), np.array([0.0, 0.5, 1.0, 1.5]) * np.pi
 
 
-def captures(photons=1e4, count=2, seed=1):
+def captures(photons=1e4, count=2, seed=1, lit=True):
     """Images of random fields through a finer grid, with noise; and the amplitudes (count, 2, m) that made them."""
     rng = np.random.default_rng(seed)
     c = rng.standard_normal((count, 2, BUNDLE.cores)) + 1j * rng.standard_normal((count, 2, BUNDLE.cores))
+    c = c * lit
     seen = BUNDLE.image(c, FRAME, PIXEL, np.r_[0.0, NEAR], oversampling=2)
     h, v = seen[:, 0, 0], seen[:, 0, 1]
     views = [np.abs(seen[:, 1 + i, 0]) ** 2 for i in range(7)]
@@ -115,6 +117,26 @@ def test_a_dark_capture_is_not_known_to_be_nought(given):
     assert np.all(found.variance[1, 0] > 0.1)  # photo-electrons: the read noise of the pixels of a mode
     assert np.all(found.variance[1, 1] >= found.variance[1, 0])
     assert np.linalg.norm(turned(found.values[:1], truth[:1]) - truth[:1]) < 0.02 * np.linalg.norm(truth[:1])
+
+
+@pytest.mark.parametrize("method", ["modes", "pixels"])
+def test_v_of_fibrelets_that_nothing_lights_is_known_to_be_weak(method):
+    """A spot, as in a calibration: elsewhere H and V are dark, and the mean over the phase steps says so."""
+    lit = np.hypot(*FIBRELETS.centres.T) < 8e-6
+    images, truth = captures(lit=lit)
+    if method == "modes":
+        found = Modal(FIBRELETS).amplitudes(images, range(2))
+        values, variance = found.values, found.variance
+    else:
+        found = _Run(GerchbergSaxton(), FIBRELETS).amplitudes(images, "spots")
+        values, variance = found.values, found.variance
+    bright = (np.abs(truth[..., lit]) ** 2).mean()
+    far = np.hypot(*FIBRELETS.centres.T) > 16e-6
+    assert variance[:, 1][:, far].mean() < 1e-3 * bright
+    errors = np.abs(values[:, 1][:, far]) ** 2
+    assert errors.mean() < 2 * variance[:, 1][:, far].mean()
+    turn = turned(values, truth)
+    assert np.linalg.norm(turn[:, 1] - truth[:, 1]) < 0.05 * np.linalg.norm(truth[:, 1])
 
 
 def test_saturated_pixels_are_left_out_and_a_capture_of_them_is_flagged(given):

@@ -101,6 +101,29 @@ def test_less_noise_is_less_error(standard):
     assert errors[-1] < 1.0  # even then it is no worse than to answer zero
 
 
+def test_light_between_sparse_points_is_kept_out_and_costs_those_at_the_points_little():
+    """Points as far apart as the published ones, three fibrelets to each; a sample lights those in between too."""
+    sparse = scene(grid=(6, 6), pitch=7.6e-6, radius=34e-6, reference=(0.0, 31e-6))
+    points = sparse.plan.points
+    assert sparse.bundle.cores > 2.5 * len(points)
+    offsets = [np.array([a, b]) for a in (-1.9e-6, 1.9e-6) for b in (-1.9e-6, 1.9e-6)]
+    finer = np.concatenate([points + offset for offset in offsets])
+    launch = sparse.bundle.launch(finer, 3.8e-6)
+    flat = np.repeat(np.eye(2), len(finer), axis=0)  # H alone, V alone
+    flat = (sparse.bundle.transfer @ scipy.sparse.block_diag([launch, launch])) @ flat
+    rough = complex_noise(np.random.default_rng(0), (72, 40))
+    errors, mixed = {}, {}
+    for between in (0.0, ForwardInverse().between):
+        inverse = recover(sparse.calibration(1e-4, 1), ForwardInverse(between=between))
+        jones = (inverse.matrix @ flat).reshape(2, 36, 2).swapaxes(0, 1)
+        jones = jones / (np.trace(jones, axis1=1, axis2=2) / 2)[:, None, None]  # as measured against a blank
+        errors[between] = np.median(np.linalg.norm(jones - np.eye(2), axis=(1, 2)))
+        own = inverse.matrix @ (sparse.matrix @ rough)
+        mixed[between] = np.linalg.norm(own - rough) / np.linalg.norm(rough)
+    assert errors[0.1] < 0.25 * errors[0.0]
+    assert mixed[0.1] < 0.05
+
+
 def test_a_window_too_small_costs_and_a_large_one_does_not(standard, inverse):
     fields, z = standard.calibration(NOISE, 1), held_out(standard)["rough"]
     narrow, wide = (error(recover(fields, ForwardInverse(window=w)), standard, z) for w in (8e-6, 60e-6))
