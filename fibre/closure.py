@@ -7,6 +7,7 @@ turn that variance into the one the closure errors show. Called by ``retrieve_fi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -23,7 +24,8 @@ FAILED = 4.0  # squared closure errors over the expected, above which a group is
 class NoiseScale:
     """True variance = inflation x stated variance + relative_error^2 x |field|^2 + stray^2 x mean |field|^2.
 
-    inflation >= 1; the mean is that of a capture, over both polarisations and all fibrelets.
+    inflation >= 1; the mean is that of a capture, over both polarisations and all fibrelets. No variance is inflated to
+    more than the power that there may be.
     """
 
     inflation: float = 1.0
@@ -35,11 +37,13 @@ class NoiseScale:
         factors = np.array([self.inflation, self.relative_error**2, self.stray**2])
         return np.asarray(factors[: len(errors) - 1] @ errors[1:])
 
-    def variance(self, fields: np.ndarray, stated: np.ndarray) -> np.ndarray:
-        """Variance of ``fields`` (..., 2, m) whose image noise alone gives ``stated``."""
+    def variance(self, fields: np.ndarray, stated: np.ndarray, most: Any = np.inf) -> np.ndarray:
+        """Variance of ``fields`` (..., 2, m) whose image noise alone gives ``stated``; ``most``: the power of their
+        prior, which is all there is to know of a field that the images do not show."""
         power = np.abs(fields) ** 2
         mean = power.mean((-2, -1), keepdims=True)
-        return self.inflation * stated + self.relative_error**2 * power + self.stray**2 * mean
+        inflated = np.minimum(self.inflation * stated, np.maximum(stated, most))
+        return inflated + self.relative_error**2 * power + self.stray**2 * mean
 
 
 def closure_errors(fields: np.ndarray, variance: np.ndarray, states: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import scipy.spatial
 from tqdm import tqdm
 
 from fibre.calibration import positions_on_camera
-from fibre.closure import closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
+from fibre.closure import NoiseScale, closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
 from fibre.drift import Drift, track_drift
 from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
 from fibre.interference import relative_phase
@@ -42,16 +42,21 @@ APART = 5.0  # fibrelets between neighbouring spots, from which on the light of 
 
 @dataclass(frozen=True)
 class _Amplitudes:
-    """Mode amplitudes of some captures, complex (captures, 2, m), the variance that the image noise explains, and the
-    retrieval's status (captures,)."""
+    """Mode amplitudes of some captures, complex (captures, 2, m), the variance that the image noise explains, the
+    retrieval's status (captures,), and the most that a variance can be."""
 
     values: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
     status: np.ndarray = array(("capture",), "1")
+    most: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
 
     def of(self, captures: np.ndarray) -> _Amplitudes:
         """Some of the captures."""
-        return _Amplitudes(self.values[captures], self.variance[captures], self.status[captures])
+        return _Amplitudes(self.values[captures], self.variance[captures], self.status[captures], self.most[captures])
+
+    def stated(self, noise: NoiseScale) -> np.ndarray:
+        """The variance with all that the images' noise does not explain."""
+        return noise.variance(self.values, self.variance, self.most)
 
     def in_phase_with(self, reference: np.ndarray) -> _Amplitudes:
         """Turn every capture so that the reference spot has the phase it has alone."""
@@ -192,7 +197,7 @@ def retrieve_fields(
             fields.values[chosen] = part.values
         errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
         noise, factors = noise_of_groups(errors)
-        variance = noise.variance(fields.values, fields.variance)
+        variance = fields.stated(noise)
         for (chosen, _), factor in zip(groups, factors, strict=True):
             variance[chosen] *= factor
         return CalibrationFields(
@@ -227,9 +232,9 @@ def retrieve_fields(
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
     return RecordingFields(
         fields.values - mean_reference,
-        noise.variance(fields.values, fields.variance),
+        fields.stated(noise),
         blank.values - mean_reference,
-        noise.variance(blank.values, blank.variance),
+        blank.stated(noise),
         noise.inflation,
         noise.relative_error,
         fibrelets,
@@ -265,7 +270,7 @@ def retrieve_sample(
     return replace(
         before,
         fields=fields.values - reference,
-        variance=noise.variance(fields.values, fields.variance),
+        variance=fields.stated(noise),
         inflation=noise.inflation,
         relative_error=noise.relative_error,
         status=fields.status,
@@ -366,7 +371,9 @@ class _Run:
                         kept.write(f"capture_{start:06d}", found)
                 done.append(found)
                 bar.update(len(part))
-        whole = _Amplitudes(*(np.concatenate([getattr(d, f) for d in done]) for f in ("values", "variance", "status")))
+        whole = _Amplitudes(
+            *(np.concatenate([getattr(d, f) for d in done]) for f in ("values", "variance", "status", "most"))
+        )
         return self._corrected(whole, images.times)
 
     def _corrected(self, whole: _Amplitudes, times: np.ndarray) -> _Amplitudes:
@@ -425,7 +432,7 @@ class _Run:
         retrieved = retrieve(diversity, self.method, batch=self.batch)
         fringes = relative_phase(radiance[:, planes:], images.steps, 1 / noise[:, planes:])
         values = np.empty((len(part), 2, len(self.fibrelets.centres)), complex)
-        variance = np.empty(values.shape)
+        variance, most = np.empty(values.shape), np.empty(values.shape)
         for i in range(len(part)):
             h, h_variance = retrieved.field[i].astype(complex), retrieved.variance[i].astype(float)
             intensity = np.abs(h) ** 2
@@ -437,11 +444,12 @@ class _Run:
             v_variance = np.where(np.isfinite(v) & np.isfinite(v_variance), v_variance, np.inf)
             known = np.where(np.isfinite(fringes.variance[i]), 1 / fringes.variance[i], 0)
             light = 2 * fringes.mean[i] - intensity  # |V|^2
-            values[i, 1], variance[i, 1] = basis.amplitudes(v, v_variance, local(light, known, power))
+            most[i, 0], most[i, 1] = power, local(light, known, power)
+            values[i, 1], variance[i, 1] = basis.amplitudes(v, v_variance, most[i, 1])
             # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
             ratio = np.abs(values[i, 1]) ** 2 / (np.abs(values[i, 0]) ** 2 + variance[i, 0])
             variance[i, 1] += ratio * variance[i, 0]
-        return _Amplitudes(values, variance, retrieved.status)
+        return _Amplitudes(values, variance, retrieved.status, most)
 
 
 def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:

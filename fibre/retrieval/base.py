@@ -41,11 +41,13 @@ class RetrievalMethod(ABC):
 
 
 class Amplitudes(NamedTuple):
-    """Of some captures: values complex (b, 2, m), their variance, status (b,), :class:`fibre.RetrievalStatus`."""
+    """Of some captures: values complex (b, 2, m), their variance, status (b,), :class:`fibre.RetrievalStatus`, and the
+    most that a variance can be, (b, 2, m): the power that the prior of the amplitude allows; infinite without one."""
 
     values: np.ndarray
     variance: np.ndarray
     status: np.ndarray
+    most: np.ndarray
 
 
 class ModeMethod(RetrievalMethod):

@@ -27,8 +27,8 @@ def second_polarisation(
     fringes: np.ndarray,
     noise: np.ndarray,
     steps: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    r"""Amplitudes v of V, complex (m,), and their variance, from images in which H and V interfere.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    r"""Amplitudes v of V, complex (m,), their variance and that of their prior, from images in which H and V interfere.
 
     .. math:: \min_v \sum_x \frac{|p(x) - H^*(x) (G v)(x)|^2}{\mathrm{var}\,p(x)} + \sum_k |v_k|^2 / P_k
 
@@ -50,7 +50,8 @@ def second_polarisation(
     # of a dark H at least what its noise would be
     most = max(float((np.abs(h) ** 2).sum()), len(h) * h_variance)
     light = 2 * found.mean - squared(field)  # |V|^2
-    ridge = (1 / local(light, weight, most)).astype(np.float32)
+    prior = local(light, weight, most)
+    ridge = (1 / prior).astype(np.float32)
     diagonal = views.squares @ strength + ridge
     scale = 1 / np.sqrt(diagonal)
 
@@ -63,7 +64,7 @@ def second_polarisation(
     variance = 1 / diagonal.astype(float)
     # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
     ratio = np.abs(value) ** 2 / (np.abs(h) ** 2 + h_variance)
-    return value.astype(complex), variance + ratio * h_variance
+    return value.astype(complex), variance + ratio * h_variance, prior
 
 
 def _conjugate_gradients(normal: Callable[[np.ndarray], np.ndarray], target: np.ndarray) -> np.ndarray:

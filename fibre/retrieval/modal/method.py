@@ -121,7 +121,7 @@ class Modal(ModeMethod):
         masks = defocus_masks(images.frame, distances.tobytes(), images.wavelength, images.pixel_size)
         cores = os.cpu_count() or 1
 
-        def one(radiance: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        def one(radiance: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
             with scipy.fft.set_workers(max(1, cores // len(captures))):
                 stack = Stack(radiance[None, :planes], noise[None, :planes], masks, distances, images.wavelength,
                               images.pixel_size)  # fmt: skip
@@ -131,21 +131,21 @@ class Modal(ModeMethod):
                 floor, misfitted = _judged(found, coarse, spread)
                 # a coarse pixel is the mean of step^2 of the camera's, and modes are of unit power over those
                 floor *= geometry.views.step**2
-                second, variance = second_polarisation(
+                second, variance, prior = second_polarisation(
                     geometry.views, geometry.local, found.amplitudes, floor, radiance[planes:], noise[planes:],
                     images.steps,
                 )  # fmt: skip
             status = 0 if self._converged(found) else int(RetrievalStatus.NOT_CONVERGED)
             status |= int(RetrievalStatus.MISFIT) if misfitted else 0
             both = np.stack([found.amplitudes, second]), np.stack([np.full(variance.shape, floor), variance])
-            return *both, status
+            return *both, status, np.stack([np.full(prior.shape, np.inf), prior])
 
         # one more than there are cores: three captures end together on two
         with ThreadPoolExecutor(min(len(captures), cores + 1)) as pool:
             # read here, one after the other: a lazy stack makes its parts together, and not in two threads
             tasks = [pool.submit(one, *_read(images, c)) for c in captures]
-            values, variances, status = zip(*(task.result() for task in tasks), strict=True)
-        return Amplitudes(np.stack(values), np.stack(variances), np.array(status, np.uint8))
+            values, variances, status, most = zip(*(task.result() for task in tasks), strict=True)
+        return Amplitudes(np.stack(values), np.stack(variances), np.array(status, np.uint8), np.stack(most))
 
     def _converged(self, found: Found) -> bool:
         return found.step <= max(self.tolerance, 2e-2)

@@ -18,21 +18,26 @@ LANES, STEPS = 4000, 40
 LEAST = 1e-4  # probability below which a test of a fixed seed objects
 
 
-def run(step, start, dtype, seed, steps=STEPS):
-    """The last of so many steps of every lane, all begun at one place."""
+def run(step, given, start, dtype, seed, steps=STEPS):
+    """The last of so many steps of every lane, all begun at one place; ``given``: what the density depends on.
 
-    @jax.jit
-    def advance(stream):
-        def one(_, carry):
-            stream, old = carry
-            random = Random(stream, dtype)
-            new = step(random, old)
-            return random.stream, new
+    Code is compiled for a step and a precision; the densities are its arguments.
+    """
+    full = partial(jnp.full, (1, LANES), dtype=dtype)
+    given = [full(x) if np.ndim(x) == 0 else jnp.asarray(x, dtype) for x in given]
+    last = _advance(step, dtype, given, jax.tree.map(full, start), begin(seed, np.arange(LANES), 1), steps)
+    return jax.tree.map(lambda x: np.asarray(x, float)[0], last)
 
-        first = jax.tree.map(lambda x: jnp.full((1, LANES), x, dtype), start)
-        return jax.lax.fori_loop(0, steps, one, (stream, first))[1]
 
-    return jax.tree.map(lambda x: np.asarray(x, float)[0], advance(begin(seed, np.arange(LANES), 1)))
+@partial(jax.jit, static_argnums=(0, 1))
+def _advance(step, dtype, given, first, stream, steps):
+    def one(_, carry):
+        stream, old = carry
+        random = Random(stream, dtype)
+        new = step(random, *given, old)
+        return random.stream, new
+
+    return jax.lax.fori_loop(0, steps, one, (stream, first))[1]
 
 
 def angles(pair):
@@ -51,9 +56,8 @@ def numerical(log_density, low, high):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("concentration", [0.0, 0.3, 3.0, 400.0, 1e8])
 def test_von_mises(dtype, concentration):
-    b, c = (dtype(concentration * x) for x in (np.cos(2.0), np.sin(2.0)))
-    step = partial(circle.von_mises, b=jnp.full((1, LANES), b), c=jnp.full((1, LANES), c))
-    found = angles(run(lambda random, old: step(random, old=old), (1.0, 0.0), dtype, 1))
+    given = [concentration * x for x in (np.cos(2.0), np.sin(2.0))]
+    found = angles(run(circle.von_mises, given, (1.0, 0.0), dtype, 1))
     # about the mean: a single precision angle near 2 is known to 1e-7 only, a tenth of a percent of the width at 1e8
     off = np.remainder(found - 2.0 + np.pi, 2 * np.pi) - np.pi
     if concentration == 0:
@@ -66,8 +70,7 @@ def test_von_mises(dtype, concentration):
 
 @pytest.mark.parametrize(("b", "c"), [(0.0, 0.0), (3.0, 2.0), (-3.0, 5.0), (-0.5, -0.3), (-40.0, 900.0), (200.0, -1e4)])
 def test_half_circle(b, c):
-    step = partial(circle.half_circle, b=jnp.full((1, LANES), b), c=jnp.full((1, LANES), c))
-    found = angles(run(lambda random, old: step(random, old=old), (1.0, 0.0), float, 2))
+    found = angles(run(circle.half_circle, (b, c), (1.0, 0.0), float, 2))
     cdf = numerical(lambda y: b * np.cos(y) + c * np.sin(y), -np.pi / 2, np.pi / 2)
     assert kstest(found, cdf).pvalue > LEAST
 
@@ -81,9 +84,8 @@ CASES = [
 
 @pytest.mark.parametrize(("b", "c", "linear", "square"), CASES)
 def test_diattenuation(b, c, linear, square):
-    given = [jnp.full((1, LANES), x) for x in (b, c, linear, square)]
     # it takes a while to come from far away
-    found = angles(run(lambda random, old: circle.diattenuation(random, *given, old), (1.0, 0.0), float, 3, 200))
+    found = angles(run(circle.diattenuation, (b, c, linear, square), (1.0, 0.0), float, 3, 200))
 
     def log_density(y):
         d = np.sin(2 * y)
@@ -102,9 +104,8 @@ def test_most_candidates_of_the_diattenuation_are_taken_where_its_linear_part_is
     y, stokes = rng.uniform(-0.6, 0.6, (1, LANES)), size * rng.uniform(-0.9, 0.9, (1, LANES))
     along, across = 2 * (size + stokes * np.sin(2 * y)), 2 * stokes * np.cos(2 * y)
     b, c, linear = along * np.cos(y) - across * np.sin(y), along * np.sin(y) + across * np.cos(y), -stokes
-    given = [jnp.asarray(x, dtype) for x in (b, c, linear, np.zeros_like(b))]
-    last = [run(lambda random, old: circle.diattenuation(random, *given, old), (1.0, 0.0), dtype, 6, steps)
-            for steps in (30, 31)]  # fmt: skip
+    given = b, c, linear, np.zeros_like(b)
+    last = [run(circle.diattenuation, given, (1.0, 0.0), dtype, 6, steps) for steps in (30, 31)]
     assert np.mean(last[0][1] != last[1][1]) > 0.6
 
 
@@ -114,11 +115,14 @@ TWO = [
 ]  # fmt: skip
 
 
+def _two_harmonics(random, b, c, d, e, old):
+    return circle.two_harmonics(random, (b, c), (d, e), old)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(("b", "c", "d", "e"), TWO)
 def test_two_harmonics(b, c, d, e, dtype):
-    first, second = ([jnp.full((1, LANES), x, dtype) for x in pair] for pair in ((b, c), (d, e)))
-    found = angles(run(lambda random, old: circle.two_harmonics(random, first, second, old), (1.0, 0.0), dtype, 7, 200))
+    found = angles(run(_two_harmonics, (b, c, d, e), (1.0, 0.0), dtype, 7, 200))
     cdf = numerical(lambda y: b * np.cos(y) + c * np.sin(y) + d * np.cos(2 * y) + e * np.sin(2 * y), -np.pi, np.pi)
     assert kstest(found, cdf).pvalue > LEAST
 
@@ -128,14 +132,17 @@ def test_slices_of_a_density_with_two_peaks():
         double = pair[0] ** 2 - pair[1] ** 2
         return 1.5 * double + 0.5 * pair[1]
 
-    found = angles(run(lambda random, old: circle.slice_step(random, log_density, 4.0, old), (1.0, 0.0), float, 4))
+    def step(random, old):
+        return circle.slice_step(random, log_density, 4.0, old)
+
+    found = angles(run(step, (), (1.0, 0.0), float, 4))
     cdf = numerical(lambda y: 1.5 * np.cos(2 * y) + 0.5 * np.sin(y), -np.pi, np.pi)
     assert kstest(found, cdf).pvalue > LEAST
 
 
 @pytest.mark.parametrize("shape", [1.0, 4.5, 3000.0])
 def test_gamma(shape):
-    found = run(lambda random, old: random.gamma(jnp.full((1, LANES), shape), old), shape, float, 5)
+    found = run(Random.gamma, (shape,), shape, float, 5)
     assert kstest(found, gamma_distribution(shape).cdf).pvalue > LEAST
 
 
