@@ -21,6 +21,8 @@ from polinfer.threads import each
 
 __all__ = ["Bracket", "InverseVariance", "LongestUnsaturated", "MergeRule", "Merged", "merge_exposures", "merge_views"]
 
+PIXELS = 1 << 18  # merged at a time
+
 
 @dataclass(frozen=True)
 class Bracket:
@@ -114,7 +116,7 @@ class InverseVariance(MergeRule):
     def variance(self, time: Any, radiance: Any) -> Any:
         """See :class:`MergeRule`."""
         shot = (radiance * (radiance > 0) + self.dark) * time
-        return (shot + (self.read_noise**2 + self.gain**2 / 12)) / time**2
+        return (shot + (self.read_noise**2 + self.gain**2 / 12)) * (1 / time**2)  # one division for all pixels
 
     def weight(self, time: Any, radiance: Any) -> Any:
         """See :class:`MergeRule`."""
@@ -167,8 +169,19 @@ def merge_exposures(frames: Any, exposures: Any, full_scale: int, rule: MergeRul
     >>> merged.radiance.round(1).tolist()
     [[2000.0, 400.0]]
     """
-    one_of_types("rule", rule, (MergeRule,), "pass InverseVariance(...) or LongestUnsaturated(...).")
     frames = np.asarray(frames)
+    whole = _empty(frames.shape[1:])
+    _merge_into(whole, frames, exposures, full_scale, rule)
+    return whole
+
+
+def _empty(shape: tuple[int, ...]) -> Merged:
+    return Merged(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool))
+
+
+def _merge_into(out: Merged, frames: np.ndarray, exposures: Any, full_scale: int, rule: MergeRule) -> None:
+    """:func:`merge_exposures` into arrays that are there, some rows at a time, which stay in the processor's cache."""
+    one_of_types("rule", rule, (MergeRule,), "pass InverseVariance(...) or LongestUnsaturated(...).")
     if frames.dtype.kind not in "ui":
         raise TypeError(f"frames must be raw integer counts, got {frames.dtype}; do not scale them.")
     if frames.ndim != 3 or len(frames) == 0:
@@ -182,19 +195,20 @@ def merge_exposures(frames: Any, exposures: Any, full_scale: int, rule: MergeRul
     if np.any(np.diff(times) > 0):
         longest_first = np.argsort(-times, kind="stable")
         frames, times = frames[longest_first], times[longest_first]
-    radiance, variance, saturated = _merged(frames, times, full_scale, rule)
-    return Merged(np.asarray(radiance), np.asarray(variance), np.asarray(saturated))
+    height, width = frames.shape[1:]
+    for rows in np.array_split(np.arange(height), max(1, -(-height * width // PIXELS))):
+        own = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0)
+        parts = _merged(frames[:, own], times, full_scale, rule)
+        out.radiance[own], out.variance[own], out.saturated[own] = (np.asarray(part) for part in parts)
 
 
 def merge_views(frames: Sequence[Any], exposures: Sequence[Any], full_scale: int, rule: MergeRule) -> Merged:
     """:func:`merge_exposures` of every view of a capture, on all cores: arrays (view, y, x)."""
-    shape = (len(frames), *np.shape(frames[0])[1:])
-    whole = Merged(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, bool))
+    whole = _empty((len(frames), *np.shape(frames[0])[1:]))
 
     def one(view: int) -> None:
-        found = merge_exposures(frames[view], exposures[view], full_scale, rule)
-        whole.radiance[view], whole.variance[view] = found.radiance, found.variance
-        whole.saturated[view] = found.saturated
+        own = Merged(whole.radiance[view], whole.variance[view], whole.saturated[view])
+        _merge_into(own, np.asarray(frames[view]), exposures[view], full_scale, rule)
 
     each(one, range(len(frames)))
     return whole

@@ -197,7 +197,8 @@ def reference_region(power: np.ndarray) -> np.ndarray:
 def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float) -> scipy.sparse.csr_array:
     """Modes as columns over the pixels of a frame, sparse real (y x, m), each with a sum of squares of 1.
 
-    Of a mode at the frame's edge that is the sum over the pixels beyond it too.
+    A mode ends three of its radii from its centre. Of one at the frame's edge the sum is that over the pixels beyond it
+    too.
     """
     reach = int(np.ceil(3 * fibrelets.mode_radius.max() / pixel_size))
     w = fibrelets.mode_radius[:, None]
@@ -207,7 +208,9 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
     place = np.rint(pixel).astype(int)[:, None] + offset
     inside = ((place >= 0) & (place < np.array(shape))).all(-1)
     distance2 = ((place - pixel[:, None]) ** 2).sum(-1) * pixel_size**2
-    values = np.exp(-distance2 / w**2)
+    near = distance2 <= (3 * w) ** 2
+    inside &= near
+    values = np.where(near, np.exp(-distance2 / w**2), 0)
     values /= np.sqrt((values**2).sum(1, keepdims=True))
     mode = np.broadcast_to(np.arange(len(pixel))[:, None], inside.shape)
     row = np.ravel_multi_index(tuple(place[inside].T), shape)
@@ -234,8 +237,8 @@ class LocalPower:
 
     def __call__(self, power: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:
         """(m,), at most ``most``, from an image of the power (y, x) and its inverse variances, 0 where unusable."""
-        known = weight.ravel().astype(float)
-        strength = np.maximum(self._fourths @ known, 1e-300)
+        known = weight.ravel()
+        strength = np.maximum(self._fourths @ known, 1e-30)
         seen = self._squares @ (known * np.where(known > 0, power.ravel(), 0)) / strength
         return np.minimum(self._mean @ (np.maximum(seen, 0) + 2 / np.sqrt(strength)), most)
 

@@ -137,6 +137,14 @@ def coarse_variance(variance: np.ndarray, step: int) -> np.ndarray:
     """Variance of :func:`coarse_images` from that of the camera's pixels, infinite where one is unusable."""
     if step == 1:
         return variance
-    # strided sums: a mean over two axes of a five-dimensional view takes three times as long
-    parts = (variance[:, i::step, j::step] for i in range(step) for j in range(step))
-    return np.asarray(sum(parts, np.float32(0)) / step**4, np.float32)
+    # rows first, which are contiguous: a mean over two axes of a five-dimensional view takes six times as long
+    coarse = np.empty((len(variance), *(s // step for s in variance.shape[1:])), np.float32)
+    for image, out in zip(variance, coarse, strict=True):
+        rows = image[0::step] + image[1::step]
+        for i in range(2, step):
+            rows += image[i::step]
+        np.add(rows[:, 0::step], rows[:, 1::step], out=out)
+        for j in range(2, step):
+            out += rows[:, j::step]
+        out /= step**4
+    return coarse
