@@ -76,17 +76,18 @@ def _variance(inverse: Inverse, fields: RecordingFields, response: np.ndarray, i
     shared = response_covariance(inverse.calibration, distal)  # (2 m, 2 n, 2 n)
     own = np.concatenate([x.reshape(states, -1).T for x in (fields.variance, fields.blank_variance)], axis=1)
     covariance = shared + own[:, :, None] * np.eye(2 * states)
+    # V with V, U with U, and V with U, which stands for U with V too: one is the other's conjugate transpose
+    cut = slice(states), slice(states, 2 * states)
+    vv, uu, vu = (covariance[:, cut[i], cut[j]].reshape(len(covariance), -1) for i, j in ((0, 0), (1, 1), (0, 1)))
     parts = inverse.matrix[:count], inverse.matrix[count:]
     total = np.zeros(count)
     for p in range(2):
         a = parts[p]
         b = sum(scipy.sparse.diags_array(jones[:, p, q]) @ parts[q] for q in range(2))
-        pairs = ((a, a, 0, 0, 1), (b, b, 1, 1, 1), (a, b, 0, 1, -1), (b, a, 1, 0, -1))
-        for left, right, i, j, sign in pairs:
-            block = covariance[:, i * states : (i + 1) * states, j * states : (j + 1) * states]
-            errors = left.conj().multiply(right).tocsr() @ block.reshape(len(block), -1)
+        for left, right, block, share in ((a, a, vv, 1), (b, b, uu, 1), (a, b, vu, -2)):
+            errors = left.conj().multiply(right).tocsr() @ block
             # e P e^H = sum of P_ts E[e_s^* e_t]
-            total += sign * np.einsum("ist,its->i", errors.reshape(count, states, states), projector).real
+            total += share * np.einsum("ist,its->i", errors.reshape(count, states, states), projector).real
     # what the regularisation mixes in from neighbours that differ, seen by sending the estimates through it once more
     known = columns(inverse.calibration).values
     again = (inverse.matrix @ (known @ distal)).reshape(2, count, 2 * states).swapaxes(0, 1)

@@ -267,7 +267,7 @@ def _read(images: Images, capture: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance of a capture and its variance, infinite where saturated, float32 (image, y, x)."""
     radiance = np.asarray(images.radiance[capture], np.float32)
     noise, saturated = np.asarray(images.variance[capture], np.float32), np.asarray(images.saturated[capture])
-    if np.any(np.isfinite(noise[saturated])):
+    if saturated.any() and np.any(np.isfinite(noise[saturated])):
         noise = np.where(saturated, np.float32(np.inf), noise)
     return radiance, noise
 
