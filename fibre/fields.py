@@ -17,7 +17,15 @@ import scipy.spatial
 from tqdm import tqdm
 
 from fibre.calibration import positions_on_camera
-from fibre.closure import NoiseScale, closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
+from fibre.closure import (
+    NoiseScale,
+    closure_errors,
+    closure_phase_maps,
+    closure_phases,
+    closure_tilts,
+    noise_of_groups,
+    noise_scale,
+)
 from fibre.drift import Drift, track_drift
 from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
 from fibre.interference import relative_phase
@@ -77,6 +85,14 @@ class _Amplitudes:
         pistons, tilts = closure_tilts(fields, variance, states, fibrelets.centres[outside])
         phase = pistons[:, None] + tilts @ (fibrelets.centres - middle).T
         return replace(self, values=self.values * np.exp(1j * phase)[:, None])
+
+    def closed_over_the_facet(self, reference: np.ndarray, states: np.ndarray, fibrelets: Fibrelets) -> _Amplitudes:
+        """Captures of one scene turned by phases that change slowly over the facet, so that they close best."""
+        outside = ~_reference_region(reference)
+        fields, variance = (self.values - reference)[..., outside], self.variance[..., outside]
+        phases = np.zeros((len(self.values), len(outside)))
+        phases[:, outside] = closure_phase_maps(fields, variance, states, fibrelets.centres[outside])
+        return replace(self, values=self.values * np.exp(1j * phases)[:, None])
 
     def closed_apart(self, reference: np.ndarray, states: np.ndarray, owner: np.ndarray) -> _Amplitudes:
         """Captures of spots whose light does not meet, that of each turned by itself; ``owner`` (m,): its spot."""
@@ -225,7 +241,11 @@ def retrieve_fields(
     fields = run.amplitudes(record.images, "sample").in_phase_with(mean_reference)
     blank = run.amplitudes(record.blank, "blank").in_phase_with(mean_reference)
     tilting = fibrelets if tracked else None
-    fields, blank = (part.closed(mean_reference, record.illumination, tilting) for part in (fields, blank))
+    states = record.illumination
+    fields, blank = (
+        part.closed(mean_reference, states, tilting).closed_over_the_facet(mean_reference, states, fibrelets)
+        for part in (fields, blank)
+    )
     errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
     # a sample's light is everywhere: what strays cannot be told from what is in proportion
     noise = noise_scale(np.concatenate(errors, axis=1)[:3])
@@ -265,7 +285,7 @@ def retrieve_sample(
         raise ValueError(f"images must have one capture per state ({states.shape[1]}), got {images.captures}.")
     reference = calibration_fields.reference
     fields = _Run(method, before.fibrelets).amplitudes(images, "sample").in_phase_with(reference)
-    fields = fields.closed(reference, states, None)
+    fields = fields.closed(reference, states, None).closed_over_the_facet(reference, states, before.fibrelets)
     noise = noise_scale(_closure(fields, reference, states)[:3])
     return replace(
         before,

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from fibre.closure import NoiseScale, closure_errors, closure_phases, closure_tilts, noise_of_groups, noise_scale
+from fibre.closure import (
+    NoiseScale,
+    closure_errors,
+    closure_phase_maps,
+    closure_phases,
+    closure_tilts,
+    noise_of_groups,
+    noise_scale,
+)
 
 
 def states(n, seed=0):
@@ -159,3 +167,38 @@ def test_two_states_tell_no_tilt():
     pistons, tilts = closure_tilts(np.ones((2, 5)), np.ones((2, 5)), np.eye(2), np.arange(10.0).reshape(5, 2))
     assert np.all(pistons == 0)
     assert np.all(tilts == 0)
+
+
+def _over_a_facet(noise, bend, seed=3):
+    """Fields of a lattice of fibrelets in three states, captures bent by a slow wave of amplitude ``bend``."""
+    rng = np.random.default_rng(seed)
+    states = np.array([[1, 1, 1], np.exp(2j * np.pi * np.arange(3) / 3)]) / np.sqrt(2)
+    centres = np.stack(np.mgrid[:48, :44], -1).reshape(-1, 2) * 4.5e-6
+    response = rng.standard_normal((2, 2, len(centres))) + 1j * rng.standard_normal((2, 2, len(centres)))
+    clean = np.einsum("pam,an->npm", response, states)
+    wave = np.array([0.2, 0.8, -1.0])[:, None] * bend * np.cos(centres[:, 0] / 60e-6) * np.sin(centres[:, 1] / 70e-6)
+    error = rng.standard_normal(clean.shape) + 1j * rng.standard_normal(clean.shape)
+    fields = clean * np.exp(1j * wave)[:, None] + noise * error / np.sqrt(2)
+    return fields, np.full(fields.shape, noise**2), states, centres, wave
+
+
+def test_phases_that_change_over_the_facet_are_found_but_for_what_all_captures_share():
+    fields, variance, states, centres, wave = _over_a_facet(0.05, 0.6)
+    found = closure_phase_maps(fields, variance, states, centres)
+    np.testing.assert_allclose(found.mean(0), 0, atol=1e-6)
+    left = found + wave - (found + wave).mean(0)
+    inner = np.all((centres > 25e-6) & (centres < centres.max(0) - 25e-6), axis=1)
+    # what windows and the interpolation between them, of 22 um and 0.7 of that, smooth away of the wave
+    smoothed = 1 - np.exp(-0.5 * 22.5e-6**2 * (1 + 0.7**2) * (1 / 60e-6**2 + 1 / 70e-6**2))
+    assert np.std(left[:, inner]) < 1.2 * smoothed * np.std(wave)
+    before, after = (closure_errors(f, variance, states)[0].mean() for f in
+                     (fields, fields * np.exp(1j * found)[:, None]))  # fmt: skip
+    assert before > 20 * 0.05**2
+    assert after < 0.05**2 + (left**2).mean() * (np.abs(fields) ** 2).mean()
+
+
+def test_noise_alone_and_two_states_bend_nothing():
+    fields, variance, states, centres, _ = _over_a_facet(0.05, 0.0)
+    assert np.all(closure_phase_maps(fields, variance, states, centres) == 0)
+    assert np.all(closure_phase_maps(fields[:2], variance[:2], states[:, :2], centres) == 0)
+    assert np.all(closure_phase_maps(fields[..., :1], variance[..., :1], states, centres[:1]) == 0)
