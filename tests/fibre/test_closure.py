@@ -194,7 +194,8 @@ def test_phases_that_change_over_the_facet_are_found_but_for_what_all_captures_s
     before, after = (closure_errors(f, variance, states)[0].mean() for f in
                      (fields, fields * np.exp(1j * found)[:, None]))  # fmt: skip
     assert before > 20 * 0.05**2
-    assert after < 0.05**2 + (left**2).mean() * (np.abs(fields) ** 2).mean()
+    # phases left over whose sum vanishes enter with 3/2, since the terms that close are 120 degrees apart
+    assert after < 1.1 * (0.05**2 + 1.5 * (left**2).mean() * (np.abs(fields) ** 2).mean())
 
 
 def test_noise_alone_and_two_states_bend_nothing():
