@@ -18,10 +18,17 @@ __all__ = ["ForwardInverse"]
 
 
 class _Known(NamedTuple):
-    """The columns, rows first, and what is not known of each mode's row of A, summed over all inputs (2 m,)."""
+    """The columns, rows first, and what is not known of each mode's row of A, summed over all inputs (2 m,): the noise
+    of those at the points, and those between them."""
 
     values: scipy.sparse.csr_array
-    ridge: np.ndarray
+    noise: np.ndarray
+    between: np.ndarray
+
+    @property
+    def ridge(self) -> np.ndarray:
+        """Lambda, (2 m,)."""
+        return self.noise + self.between
 
 
 @dataclass(frozen=True)
@@ -38,11 +45,15 @@ class ForwardInverse(RowByRow):
     and between them: L is what light where no spot was puts on a fibrelet (:func:`fibre.calibration.unmeasured`), and
     :math:`\beta` how bright it is there against the points. Without it a row may use fibrelets that the points hardly
     light, as long as the calibration's noise is small, and a real sample lights those too. So the regularisation is set
-    by the noise and the lattice, not by hand; ``strength`` multiplies the first.
+    by the noise and the lattice, not by hand; ``strength`` multiplies the first. At the minimum a row answers
+    :math:`1 - \|e - a \hat A\|^2 - a \Lambda a^H` to its own point; what of that loss is due to L is made good by a
+    factor on the row, which loses nothing against noise: amplitudes stay right.
 
     Parameters
     ----------
-    window: metres, side of the square of fibrelets that a row may use. strength: >= 0, 1 is the noise's own.
+    window: metres, side of the square of fibrelets that a row may use. strength: >= 0, 1 is the noise's own. between:
+    beta, >= 0; 1 is the light of an evenly lit sample that has nothing in common with that at the points, 0: light at
+    the points alone.
 
     Source: errors-in-variables ridge regression; the paper's window is the spacing of parallel spots, 68.2 um.
     """
@@ -60,7 +71,7 @@ class ForwardInverse(RowByRow):
         """See :meth:`RowByRow.prepared`."""
         known = columns(fields)
         noise = np.asarray(known.variance.sum(axis=1)).ravel()
-        return _Known(known.values, self.strength * noise + self.between * np.tile(unmeasured(fields), 2))
+        return _Known(known.values, self.strength * noise, self.between * np.tile(unmeasured(fields), 2))
 
     def usable(self, prepared: _Known) -> np.ndarray:
         """Those with columns."""
@@ -78,4 +89,10 @@ class ForwardInverse(RowByRow):
         gram = (block @ block.conj().T).toarray() + np.diag(prepared.ridge[chosen])
         count = prepared.values.shape[1] // 2
         target = block[:, np.concatenate([points, points + count])].toarray()  # a = e A^H (A A^H + L)^-1
-        return np.asarray(scipy.linalg.solve(gram, target, assume_a="pos")).conj().T
+        rows = np.asarray(scipy.linalg.solve(gram, target, assume_a="pos")).conj().T
+        # how far each row falls short of answering 1 to its own point, and which share of that is the noise's
+        own = np.einsum("rk,kr->r", rows, target).real
+        noise, between = (np.abs(rows) ** 2 @ part[chosen] for part in (prepared.noise, prepared.between))
+        total = noise + between
+        share = np.where(total > 0, noise / np.where(total > 0, total, 1), 1)
+        return np.asarray(rows * ((1 - (1 - own) * share) / np.where(own > 0, own, 1))[:, None])

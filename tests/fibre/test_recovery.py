@@ -121,7 +121,7 @@ def test_light_between_sparse_points_is_kept_out_and_costs_those_at_the_points_l
         own = inverse.matrix @ (sparse.matrix @ rough)
         mixed[between] = np.linalg.norm(own - rough) / np.linalg.norm(rough)
     assert errors[0.1] < 0.25 * errors[0.0]
-    assert mixed[0.1] < 0.05
+    assert mixed[0.1] < 0.01  # and their amplitude is right
 
 
 def test_a_window_too_small_costs_and_a_large_one_does_not(standard, inverse):
