@@ -15,7 +15,7 @@ __all__ = ["acquire_command", "demo_command", "devices_command", "report_command
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=Path("polinfer-demo"))
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of scene and noise.")
 @click.option(
-    "--full", is_flag=True, help="The published size, 1200 x 1200 pixels: about half an hour, and 3 GB of disk."
+    "--full", is_flag=True, help="The published size, 1200 x 1200 pixels: some ten minutes, and 3 GB of disk."
 )
 def demo_command(folder: Path, seed: int, full: bool) -> None:
     """Run the whole instrument on a simulated bench and compare with the truth; records go to FOLDER.

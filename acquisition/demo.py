@@ -23,6 +23,7 @@ from acquisition.exposure import Bracket
 from acquisition.plan import CalibrationPlan, SamplePlan, Step, Views
 from acquisition.reporting import write_report
 from acquisition.run import calibrate, capture
+from fibre.calibration import clean_fibrelets
 from fibre.retrieval.base import RetrievalMethod
 from polinfer import ComplexGain, Fit, Measurement, Model, Parameters, RetarderFirst, phantoms
 from polinfer.degeneracy import nearest
@@ -197,12 +198,12 @@ def _errors(
     inverse: fibre.Inverse,
     result: DemoResult,
 ) -> dict[str, str]:
-    """How far each stage is from the truth. Fields: of the products of neighbouring amplitudes, which no common phase
-    changes; of the inverse: of true fields sent through it, but for an amplitude and a phase a point, which the blank
-    takes out."""
+    """How far each stage is from the truth. Fields: of the products of neighbouring amplitudes beside the reference
+    spot, which no common phase changes; of the inverse: of true fields sent through it, but for an amplitude and a
+    phase a point, which the blank takes out."""
     bundle, plan = bench.scene.bundle, setup.calibration
     away, nearest_core = scipy.spatial.cKDTree(bundle.centres).query(calibration.fibrelets.centres)
-    found = away < 1e-6
+    found = (away < 1e-6) & clean_fibrelets(calibration)
     unit = np.sqrt(bench.scene.spot_power * bench.scene.camera.quantum_efficiency)
     steps = [step for step in plan.captures if step.kind == "spots"]
     some = np.unique(np.linspace(0, len(steps) - 1, 12).astype(int))
