@@ -195,6 +195,8 @@ def _merge_into(out: Merged, frames: np.ndarray, exposures: Any, full_scale: int
     if np.any(np.diff(times) > 0):
         longest_first = np.argsort(-times, kind="stable")
         frames, times = frames[longest_first], times[longest_first]
+    if frames.shape[1:] != out.radiance.shape:
+        raise ValueError(f"frames must all have one size, got {frames.shape[1:]} beside {out.radiance.shape}.")
     height, width = frames.shape[1:]
     for rows in np.array_split(np.arange(height), max(1, -(-height * width // PIXELS))):
         own = slice(rows[0], rows[-1] + 1) if len(rows) else slice(0)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from acquisition import Bracket, InverseVariance, LongestUnsaturated, merge_exposures
+from acquisition.exposure import merge_views
 
 GAIN, READ, DARK, FULL = 2.0, 3.0, 20.0, 4095
 TIMES = 0.1 / 2.0 ** np.arange(9)
@@ -143,3 +144,19 @@ def test_a_bracket_falls_by_its_factor_down_to_its_stop(factor, steps):
     assert len(times) == steps  # the stop itself is taken, in spite of rounding
     np.testing.assert_allclose(times, 0.1 / factor ** np.arange(steps))
     assert list(Bracket(longest=0.1, stop=0.06).times()) == [0.1]
+
+
+def test_views_are_merged_as_one_by_one_and_must_have_one_size():
+    rule, rng = InverseVariance(gain=2.0, read_noise=1.0), np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (k, 600, 500), np.uint8) for k in (2, 3)]  # more than is merged at a time
+    times = [[0.2, 0.1], [0.2, 0.1, 0.05]]
+    both = merge_views(frames, times, 255, rule)
+    for view in range(2):
+        one = merge_exposures(frames[view], times[view], 255, rule)
+        np.testing.assert_array_equal(both.radiance[view], one.radiance)
+        np.testing.assert_array_equal(both.variance[view], one.variance)
+        np.testing.assert_array_equal(both.saturated[view], one.saturated)
+        parts = [merge_exposures(frames[view][:, rows], times[view], 255, rule) for rows in (slice(1), slice(1, 600))]
+        np.testing.assert_allclose(one.radiance, np.concatenate([part.radiance for part in parts]), rtol=1e-6)
+    with pytest.raises(ValueError, match="frames must all have one size"):
+        merge_views([frames[0], frames[1][:, :-1]], times, 255, rule)
