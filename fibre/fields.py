@@ -16,18 +16,11 @@ import numpy as np
 import scipy.spatial
 from tqdm import tqdm
 
+from fibre.amplitudes import CaptureAmplitudes, closure_outside, mean_reference_of
 from fibre.calibration import positions_on_camera
-from fibre.closure import (
-    NoiseScale,
-    closure_errors,
-    closure_phase_maps,
-    closure_phases,
-    closure_tilts,
-    noise_of_groups,
-    noise_scale,
-)
+from fibre.closure import noise_of_groups, noise_scale
 from fibre.drift import Drift, track_drift
-from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix, reference_region
+from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix
 from fibre.interference import relative_phase
 from fibre.records import (
     Calibration,
@@ -41,84 +34,10 @@ from fibre.records import (
 from fibre.retrieval.base import ModeMethod, RetrievalMethod, retrieve
 from polinfer.checks import one_of_types
 from polinfer.kept import Kept, fingerprint
-from polinfer.storage import array
 
 __all__ = ["fibrelets_of", "pattern_groups", "retrieve_fields", "retrieve_sample"]
 
 APART = 5.0  # fibrelets between neighbouring spots, from which on the light of each is closed by itself
-
-
-@dataclass(frozen=True)
-class _Amplitudes:
-    """Mode amplitudes of some captures, complex (captures, 2, m), the variance that the image noise explains, the
-    retrieval's status (captures,), and the most that a variance can be."""
-
-    values: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
-    variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
-    status: np.ndarray = array(("capture",), "1")
-    most: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
-
-    def of(self, captures: np.ndarray) -> _Amplitudes:
-        """Some of the captures."""
-        return _Amplitudes(self.values[captures], self.variance[captures], self.status[captures], self.most[captures])
-
-    def stated(self, noise: NoiseScale) -> np.ndarray:
-        """The variance with all that the images' noise does not explain."""
-        return noise.variance(self.values, self.variance, self.most)
-
-    def in_phase_with(self, reference: np.ndarray) -> _Amplitudes:
-        """Turn every capture so that the reference spot has the phase it has alone."""
-        overlap = np.einsum("pk,cpk->c", np.conj(reference) * _reference_region(reference), self.values)
-        return self.turned(-np.angle(overlap))
-
-    def turned(self, phases: np.ndarray) -> _Amplitudes:
-        """Every capture turned by its phase, radians."""
-        return replace(self, values=self.values * np.exp(1j * phases)[:, None, None])
-
-    def closed(self, reference: np.ndarray, states: np.ndarray, fibrelets: Fibrelets | None) -> _Amplitudes:
-        """Captures of one scene in several states, turned so that they close best; with ``fibrelets`` tilted too."""
-        outside = ~_reference_region(reference)
-        fields, variance = (self.values - reference)[..., outside], self.variance[..., outside]
-        if fibrelets is None:
-            return self.turned(closure_phases(fields, variance, states))
-        middle = fibrelets.centres[outside].mean(0)
-        pistons, tilts = closure_tilts(fields, variance, states, fibrelets.centres[outside])
-        phase = pistons[:, None] + tilts @ (fibrelets.centres - middle).T
-        return replace(self, values=self.values * np.exp(1j * phase)[:, None])
-
-    def closed_over_the_facet(self, reference: np.ndarray, states: np.ndarray, fibrelets: Fibrelets) -> _Amplitudes:
-        """Captures of one scene turned by phases that change slowly over the facet, so that they close best."""
-        outside = ~_reference_region(reference)
-        fields, variance = (self.values - reference)[..., outside], self.variance[..., outside]
-        phases = np.zeros((len(self.values), len(outside)))
-        phases[:, outside] = closure_phase_maps(fields, variance, states, fibrelets.centres[outside])
-        return replace(self, values=self.values * np.exp(1j * phases)[:, None])
-
-    def closed_apart(self, reference: np.ndarray, states: np.ndarray, owner: np.ndarray) -> _Amplitudes:
-        """Captures of spots whose light does not meet, that of each turned by itself; ``owner`` (m,): its spot."""
-        outside = ~_reference_region(reference)
-        fields, values = self.values - reference, self.values.copy()
-        for spot in np.unique(owner):
-            near = outside & (owner == spot)
-            phases = closure_phases(fields[..., near], self.variance[..., near], states)
-            values[..., near] = reference[:, near] + fields[..., near] * np.exp(1j * phases)[:, None, None]
-        return replace(self, values=values)
-
-
-def _mean_reference(reference: _Amplitudes) -> np.ndarray:
-    """The reference spot alone, complex (2, m), 0 where its light is not clearly above the noise.
-
-    It is subtracted from every capture; subtracting noise would put the same error into all states, where their
-    closure cannot see it. The image noise is some ten times less than what retrieval really leaves in the dark.
-    """
-    mean = reference.in_phase_with(reference.values[0]).values.mean(0)
-    noise = 10 * reference.variance.mean(0) / len(reference.values)
-    return mean * np.maximum(1 - noise / np.maximum(np.abs(mean) ** 2, 1e-300), 0)
-
-
-def _reference_region(reference: np.ndarray) -> np.ndarray:
-    """Fibrelets that carry the reference spot of this field (2, m)."""
-    return reference_region((np.abs(reference) ** 2).sum(0))
 
 
 @overload
@@ -200,7 +119,7 @@ def retrieve_fields(
         run, reference = _Run(method, fibrelets, progress, None, folder, _closes(groups)).following(
             drift, record.references, anchor
         )
-        mean_reference = _mean_reference(reference)
+        mean_reference = mean_reference_of(reference)
         fields = run.amplitudes(record.images, "calibration").in_phase_with(mean_reference)
         tilting = fibrelets if tracked else None
         apart = _spots_apart(record, fibrelets)
@@ -211,7 +130,7 @@ def retrieve_fields(
             if owner is not None:
                 part = part.closed_apart(mean_reference, states, owner)
             fields.values[chosen] = part.values
-        errors = [_closure(fields.of(chosen), mean_reference, states) for chosen, states in groups]
+        errors = [closure_outside(fields.of(chosen), mean_reference, states) for chosen, states in groups]
         noise, factors = noise_of_groups(errors)
         variance = fields.stated(noise)
         for (chosen, _), factor in zip(groups, factors, strict=True):
@@ -237,7 +156,7 @@ def retrieve_fields(
     run, reference = _Run(method, fibrelets, progress, None, folder, record.illumination.shape[1] > 2).following(
         drift, record.references, anchor
     )
-    mean_reference = _mean_reference(reference)
+    mean_reference = mean_reference_of(reference)
     fields = run.amplitudes(record.images, "sample").in_phase_with(mean_reference)
     blank = run.amplitudes(record.blank, "blank").in_phase_with(mean_reference)
     tilting = fibrelets if tracked else None
@@ -246,7 +165,7 @@ def retrieve_fields(
         part.closed(mean_reference, states, tilting).closed_over_the_facet(mean_reference, states, fibrelets)
         for part in (fields, blank)
     )
-    errors = [_closure(part, mean_reference, record.illumination) for part in (fields, blank)]
+    errors = [closure_outside(part, mean_reference, states) for part in (fields, blank)]
     # a sample's light is everywhere: what strays cannot be told from what is in proportion
     noise = noise_scale(np.concatenate(errors, axis=1)[:3])
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
@@ -286,7 +205,7 @@ def retrieve_sample(
     reference = calibration_fields.reference
     fields = _Run(method, before.fibrelets).amplitudes(images, "sample").in_phase_with(reference)
     fields = fields.closed(reference, states, None).closed_over_the_facet(reference, states, before.fibrelets)
-    noise = noise_scale(_closure(fields, reference, states)[:3])
+    noise = noise_scale(closure_outside(fields, reference, states)[:3])
     return replace(
         before,
         fields=fields.values - reference,
@@ -373,7 +292,7 @@ class _Run:
     closes: bool = True
     batch: int = 8
 
-    def amplitudes(self, images: Images, name: str) -> _Amplitudes:
+    def amplitudes(self, images: Images, name: str) -> CaptureAmplitudes:
         """Of all captures, with the drift taken out; those that are in the folder are not retrieved again."""
         basis = None
         if not self._in_modes():
@@ -391,12 +310,12 @@ class _Run:
                         kept.write(f"capture_{start:06d}", found)
                 done.append(found)
                 bar.update(len(part))
-        whole = _Amplitudes(
+        whole = CaptureAmplitudes(
             *(np.concatenate([getattr(d, f) for d in done]) for f in ("values", "variance", "status", "most"))
         )
         return self._corrected(whole, images.times)
 
-    def _corrected(self, whole: _Amplitudes, times: np.ndarray) -> _Amplitudes:
+    def _corrected(self, whole: CaptureAmplitudes, times: np.ndarray) -> CaptureAmplitudes:
         if self.drift is None:
             return whole
         values = self.drift.correct(whole.values, times, self.fibrelets)
@@ -407,7 +326,7 @@ class _Run:
 
     def following(
         self, drift: Drift | str | None, references: Images, anchor: np.ndarray | None
-    ) -> tuple[_Run, _Amplitudes]:
+    ) -> tuple[_Run, CaptureAmplitudes]:
         """The run that takes the drift out, and the references without it.
 
         A drift that is tracked is that of the references, and against ``anchor``, complex (2, m), if there is one.
@@ -425,7 +344,7 @@ class _Run:
         shape = (images.captures, images.frame, images.wavelength, images.pixel_size)
         settings = (images.diversity, images.steps, images.times)
         call = fingerprint(shape, settings, ends, self.method, self.fibrelets, self.batch)
-        return Kept(Path(self.folder or "") / name, call, (_Amplitudes,), "record, method or set of fibrelets")
+        return Kept(Path(self.folder or "") / name, call, (CaptureAmplitudes,), "record, method or set of fibrelets")
 
     def _in_modes(self) -> bool:
         """Whether the method finds the amplitudes of these very fibrelets itself."""
@@ -434,12 +353,12 @@ class _Run:
         theirs, ours = self.method.fibrelets, self.fibrelets
         return np.array_equal(theirs.centres, ours.centres) and np.array_equal(theirs.mode_radius, ours.mode_radius)
 
-    def _batch(self, images: Images, part: range, given: tuple[ModeBasis, LocalPower] | None) -> _Amplitudes:
+    def _batch(self, images: Images, part: range, given: tuple[ModeBasis, LocalPower] | None) -> CaptureAmplitudes:
         """Amplitudes of some captures, H from the defocused images and V from the phase-stepped ones; ``given`` where
         the method makes fields on the camera's pixels."""
         if given is None:
             assert isinstance(self.method, ModeMethod)
-            return _Amplitudes(*self.method.amplitudes(images, part))
+            return CaptureAmplitudes(*self.method.amplitudes(images, part))
         basis, local = given
         planes = len(images.diversity)
         # all of one capture before the next: a lazy stack makes its three parts together
@@ -469,18 +388,7 @@ class _Run:
             # dividing by a weak H carries its error over, and that error is the whole mode's, not a pixel's
             ratio = np.abs(values[i, 1]) ** 2 / (np.abs(values[i, 0]) ** 2 + variance[i, 0])
             variance[i, 1] += ratio * variance[i, 0]
-        return _Amplitudes(values, variance, retrieved.status, most)
-
-
-def _closure(fields: _Amplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Closure errors (4, count) outside the reference spot, whose light does not follow the states."""
-    outside = ~_reference_region(reference)
-    values = (fields.values - reference)[..., outside]
-    squared, stated, _ = closure_errors(values, fields.variance[..., outside], states)
-    _, _, power = closure_errors(fields.values[..., outside], fields.variance[..., outside], states)
-    mean = (np.abs(fields.values) ** 2).mean((1, 2), keepdims=True)
-    _, _, light = closure_errors(np.sqrt(mean), mean, states)
-    return np.stack([squared, stated, power, np.broadcast_to(light, power.shape)]).reshape(4, -1)
+        return CaptureAmplitudes(values, variance, retrieved.status, most)
 
 
 def pattern_groups(calibration: Calibration) -> list[tuple[np.ndarray, np.ndarray]]:

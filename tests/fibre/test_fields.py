@@ -19,7 +19,8 @@ from fibre import (
     recover,
     retrieve_fields,
 )
-from fibre.fields import _Amplitudes, _spots_apart, pattern_groups
+from fibre.amplitudes import CaptureAmplitudes
+from fibre.fields import _spots_apart, pattern_groups
 from fibre.retrieval.base import RetrievalMethod
 from tests.fibre.benches import METHOD, PLAN, SAMPLE
 from tests.oracles import jones as oracle
@@ -228,8 +229,8 @@ def test_the_light_of_spots_that_do_not_meet_is_closed_spot_by_spot(far_apart):
             owner = spots(chosen)
             assert owner is not None
             phases = generator.uniform(-np.pi, np.pi, (len(chosen), 4))
-            part = _Amplitudes(fields[chosen] * np.exp(1j * phases)[:, None, owner], variance[chosen], np.zeros(3),
-                               np.full(variance[chosen].shape, np.inf))  # fmt: skip
+            turned, most = fields[chosen] * np.exp(1j * phases)[:, None, owner], np.full(variance[chosen].shape, np.inf)
+            part = CaptureAmplitudes(turned, variance[chosen], np.zeros(3), most)
             part = part.closed_apart(dark, states, owner) if apart else part.closed(dark, states, None)
             fields[chosen] = part.values
         found = recover(
