@@ -17,6 +17,8 @@ from polinfer.storage import array
 
 __all__ = ["CaptureAmplitudes", "closure_outside", "mean_reference_of"]
 
+DARK = 1e-4  # of the reference spot's strongest fibrelet: those that have less are dark
+
 
 @dataclass(frozen=True)
 class CaptureAmplitudes:
@@ -64,9 +66,11 @@ class CaptureAmplitudes:
         """Captures of one scene turned by phases that change slowly over the facet, so that they close best."""
         outside = ~_reference_region(reference)
         fields, variance = (self.values - reference)[..., outside], self.variance[..., outside]
-        phases = np.zeros((len(self.values), len(outside)))
-        phases[:, outside] = closure_phase_maps(fields, variance, states, fibrelets.centres[outside])
-        return replace(self, values=self.values * np.exp(1j * phases)[:, None])
+        turn = np.exp(1j * closure_phase_maps(fields, variance, states, fibrelets.centres[outside]))
+        values = self.values.copy()
+        # the reference spot's own light, also that beside its brightest fibrelets, has the phase it has alone
+        values[..., outside] = reference[:, outside] + fields * turn[:, None]
+        return replace(self, values=values)
 
     def closed_apart(self, reference: np.ndarray, states: np.ndarray, owner: np.ndarray) -> CaptureAmplitudes:
         """Captures of spots whose light does not meet, that of each turned by itself; ``owner`` (m,): its spot."""
@@ -96,11 +100,14 @@ def _reference_region(reference: np.ndarray) -> np.ndarray:
 
 
 def closure_outside(fields: CaptureAmplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Closure errors (4, count) outside the reference spot, whose light does not follow the states."""
-    outside = ~_reference_region(reference)
-    values = (fields.values - reference)[..., outside]
-    squared, stated, _ = closure_errors(values, fields.variance[..., outside], states)
-    _, _, power = closure_errors(fields.values[..., outside], fields.variance[..., outside], states)
+    """Closure errors (4, 2, count) of both polarisations where the reference spot is dark: its light does not follow
+    the states, and what a turned capture leaves of it no noise explains."""
+    power = (np.abs(reference) ** 2).sum(0)
+    outside = power <= DARK * power.max()
+    values, variance = fields.values[..., outside], fields.variance[..., outside]
+    squared, stated, _ = closure_errors(values - reference[:, outside], variance, states)
+    _, _, seen = closure_errors(values, variance, states)
     mean = (np.abs(fields.values) ** 2).mean((1, 2), keepdims=True)
     _, _, light = closure_errors(np.sqrt(mean), mean, states)
-    return np.stack([squared, stated, power, np.broadcast_to(light, power.shape)]).reshape(4, -1)
+    rows = np.stack([squared, stated, seen, np.broadcast_to(light, seen.shape)])  # (4, closures, 2, fibrelets)
+    return rows.swapaxes(1, 2).reshape(4, 2, -1)

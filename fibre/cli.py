@@ -84,7 +84,8 @@ def retrieve_command(
     status = np.concatenate(parts)
     if status.any():
         click.echo(f"{np.count_nonzero(status)} of {len(status)} captures did not converge or misfit their images")
-    said = f"noise beyond the images': x {fields.inflation:.2f}, and {100 * fields.relative_error:.2f} % of the field"
+    h, v = np.broadcast_to(fields.inflation, 2)
+    said = f"noise beyond the images': H x {h:.2f}, V x {v:.2f}, and {100 * fields.relative_error:.2f} % of the field"
     if isinstance(fields, CalibrationFields):
         said += f", and {100 * fields.stray:.2f} % of its mean"
     click.echo(said)

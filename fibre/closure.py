@@ -36,25 +36,28 @@ GAIN = 0.02  # by which they must close better
 class NoiseScale:
     """True variance = inflation x stated variance + relative_error^2 x |field|^2 + stray^2 x mean |field|^2.
 
-    inflation >= 1; the mean is that of a capture, over both polarisations and all fibrelets. No variance is inflated to
-    more than the power that there may be.
+    inflation >= 1, one of both polarisations or one of each: H is retrieved and V divided by it, and what is stated of
+    them need not be wrong alike. The mean is that of a capture, over both polarisations and all fibrelets. No variance
+    is inflated to more than the power that there may be.
     """
 
-    inflation: float = 1.0
+    inflation: float | tuple[float, float] = 1.0
     relative_error: float = 0.0
     stray: float = 0.0
 
     def expected(self, errors: np.ndarray) -> np.ndarray:
-        """Squared closure errors that are to be expected, (count,), of ``errors`` as in :func:`noise_scale`."""
-        factors = np.array([self.inflation, self.relative_error**2, self.stray**2])
-        return np.asarray(factors[: len(errors) - 1] @ errors[1:])
+        """Squared closure errors that are to be expected, (...), of ``errors`` as in :func:`noise_scale`."""
+        _, stated, *powers = errors
+        own = np.asarray(self.inflation)[..., None] * stated
+        factors = np.array([self.relative_error**2, self.stray**2][: len(powers)])
+        return np.asarray(own + np.tensordot(factors, powers, 1))
 
     def variance(self, fields: np.ndarray, stated: np.ndarray, most: Any = np.inf) -> np.ndarray:
         """Variance of ``fields`` (..., 2, m) whose image noise alone gives ``stated``; ``most``: the power of their
         prior, which is all there is to know of a field that the images do not show."""
         power = np.abs(fields) ** 2
         mean = power.mean((-2, -1), keepdims=True)
-        inflated = np.minimum(self.inflation * stated, np.maximum(stated, most))
+        inflated = np.minimum(np.asarray(self.inflation)[..., None] * stated, np.maximum(stated, most))
         return inflated + self.relative_error**2 * power + self.stray**2 * mean
 
 
@@ -229,37 +232,40 @@ def closure_tilts(
     return found[:, 0], found[:, 1:] / size
 
 
-def noise_scale(errors: np.ndarray) -> NoiseScale:
+def noise_scale(errors: np.ndarray, by_polarisation: bool = False) -> NoiseScale:
     """The noise that makes squared closure errors as large as expected, each being exponential.
 
-    ``errors`` (3 or 4, count): squared, their stated variance, the power they stem from, and the mean power of their
-    captures. Phase retrieval errs in three ways: by the image noise, alike everywhere; by a phase that wanders over the
-    frame, in proportion to the field; and by light of the bright places that it puts into dark ones, in proportion to
-    all the light (0 without the fourth row). Non-negative least squares in units of the expectation (reweighted; the
-    maximum likelihood of exponential variables), the first factor never below 1. Without data (fewer than three states)
+    ``errors`` (3 or 4, ...), with ``by_polarisation`` (3 or 4, 2, count): squared, their stated variance, the power
+    they stem from, and the mean power of their captures. Phase retrieval errs in three ways: by the image noise, alike
+    everywhere; by a phase that wanders over the frame, in proportion to the field; and by light of the bright places
+    that it puts into dark ones, in proportion to all the light (0 without the fourth row). Non-negative least squares
+    in units of the expectation (reweighted; the maximum likelihood of exponential variables), the first factor never
+    below 1, with ``by_polarisation`` one of each; the others are those of both. Without data (fewer than three states)
     nothing is changed.
     """
-    squared, stated, *powers = errors.reshape(len(errors), -1)
+    squared, stated, *powers = (row if by_polarisation else row.reshape(1, -1) for row in errors)
     if squared.size == 0:
-        return NoiseScale()
-    excess, factors = 0.0, np.zeros(len(powers))
-    factors[0] = np.sum(np.maximum(squared - stated, 0)) / max(np.sum(powers[0]), 1e-300)
+        return NoiseScale((1.0, 1.0) if by_polarisation else 1.0)
+    own = np.stack([np.where(np.arange(len(stated))[:, None] == i, stated, 0).ravel() for i in range(len(stated))])
+    terms = np.concatenate([own, np.stack([power.ravel() for power in powers])])
+    squared, stated = squared.ravel(), stated.ravel()
+    factors = np.zeros(len(terms))
+    factors[len(own)] = np.sum(np.maximum(squared - stated, 0)) / max(np.sum(powers[0]), 1e-300)
     for _ in range(30):
-        expected = (1 + excess) * stated + factors @ np.stack(powers)
-        design = np.stack([stated, *powers], 1) / expected[:, None]
-        (excess, *rest), _ = scipy.optimize.nnls(design, (squared - stated) / expected)
-        factors = np.array(rest)
-    return NoiseScale(1 + float(excess), *np.sqrt(factors).tolist())
+        expected = stated + factors @ terms
+        factors, _ = scipy.optimize.nnls((terms / expected).T, (squared - stated) / expected)
+    inflation = tuple((1 + factors[: len(own)]).tolist())
+    return NoiseScale(inflation if by_polarisation else inflation[0], *np.sqrt(factors[len(own) :]).tolist())
 
 
-def noise_of_groups(groups: list[np.ndarray]) -> tuple[NoiseScale, np.ndarray]:
+def noise_of_groups(groups: list[np.ndarray], by_polarisation: bool = False) -> tuple[NoiseScale, np.ndarray]:
     """The noise of most groups of captures, and by how much each group's variance is larger, (groups,), >= 1.
 
     A retrieval can fail in one capture of many: its group closes far worse than the others, must not set the noise
     of all, and is not to be believed as they are. The worst group is left out if its errors are more than four
     times, on average, what the noise of the others makes expected, then the next, as long as half of all are left;
     those that are out get the factor that they show, all others 1. ``groups``: errors as in :func:`noise_scale`,
-    one array (4, count) a group, none for groups of fewer than three states.
+    one array a group, empty for groups of fewer than three states.
 
     >>> rng = np.random.default_rng(0)
     >>> powers = np.ones((3, 500))
@@ -272,11 +278,12 @@ def noise_of_groups(groups: list[np.ndarray]) -> tuple[NoiseScale, np.ndarray]:
     usable = np.array([errors.size > 0 for errors in groups], bool)
     factors = np.ones(len(groups))
     if not usable.any():
-        return NoiseScale(), factors
+        return noise_scale(np.empty((3, 2, 0)), by_polarisation), factors
     kept = usable.copy()
 
     def scale_of(chosen: np.ndarray) -> NoiseScale:
-        return noise_scale(np.concatenate([e for e, k in zip(groups, chosen, strict=True) if k], axis=1))
+        errors = np.concatenate([e for e, k in zip(groups, chosen, strict=True) if k], axis=-1)
+        return noise_scale(errors, by_polarisation)
 
     def factor(scale: NoiseScale, i: int) -> float:
         return float(np.mean(groups[i][0] / np.maximum(scale.expected(groups[i]), 1e-300)))

@@ -220,8 +220,9 @@ def mode_matrix(fibrelets: Fibrelets, shape: tuple[int, int], pixel_size: float)
 class LocalPower:
     r"""The power that a mode may carry, from an image of the power, as the prior of its amplitude.
 
-    For every mode the matched filter :math:`\sum_x w\,g_k^2 I / \sum_x w\,g_k^4`, with its standard error, averaged
-    over the mode and its neighbours: what lights a fibrelet lights those beside it, and their fields interfere.
+    For every mode the matched filter :math:`\sum_x w\,g_k^2 I / \sum_x w\,g_k^4`, averaged over the mode and its
+    neighbours, and two standard errors of that mean: what lights a fibrelet lights those beside it, and their fields
+    interfere.
 
     ``squares``: of the modes, sparse (m, y x). ``centres`` (m, 2), metres.
     """
@@ -233,14 +234,16 @@ class LocalPower:
         each = np.arange(len(centres))
         pairs = np.r_[i, j, each], np.r_[j, i, each]
         beside = scipy.sparse.csr_array((np.ones(len(pairs[0])), pairs))
-        self._mean = scipy.sparse.diags_array(1 / beside.sum(axis=1)) @ beside
+        self._mean = scipy.sparse.csr_array(scipy.sparse.diags_array(1 / beside.sum(axis=1)) @ beside)
+        self._squared_mean = self._mean.power(2)
 
     def __call__(self, power: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:
         """(m,), at most ``most``, from an image of the power (y, x) and its inverse variances, 0 where unusable."""
         known = weight.ravel()
         strength = np.maximum(self._fourths @ known, 1e-30)
         seen = self._squares @ (known * np.where(known > 0, power.ravel(), 0)) / strength
-        return np.minimum(self._mean @ (np.maximum(seen, 0) + 2 / np.sqrt(strength)), most)
+        error = np.sqrt(self._squared_mean @ (1 / strength))
+        return np.minimum(np.maximum(self._mean @ seen, 0) + 2 * error, most)
 
 
 class ModeBasis:

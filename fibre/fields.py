@@ -78,13 +78,13 @@ def retrieve_fields(
     is then subtracted. The spot must stand clear of the sample: light of the sample on the spot's fibrelets turns the
     phase of its capture.
 
-    The variance is that of the image noise times an ``inflation`` plus a ``relative_error`` squared times the power
-    plus, in a calibration, a ``stray`` squared times the mean power of the capture, all found from the data: n states
-    of illumination span two dimensions, so n - 2 combinations of the fields must vanish
-    (:func:`fibre.closure.closure_errors`), and how far they do not measures all that the image noise does not
-    explain. Captures of a calibration whose states close far worse than the others' have failed: they get the
-    variance that they show (:func:`fibre.closure.noise_of_groups`). With two states there is no such check, and the
-    image noise is all that is stated.
+    The variance is that of the image noise times an ``inflation``, one of H and one of V, plus a ``relative_error``
+    squared times the power plus, in a calibration, a ``stray`` squared times the mean power of the capture, all found
+    from the data: n states of illumination span two dimensions, so n - 2 combinations of the fields must vanish
+    (:func:`fibre.closure.closure_errors`), and how far they do not measures all that the image noise does not explain.
+    Captures of a calibration whose states close far worse than the others' have failed: they get the variance that they
+    show (:func:`fibre.closure.noise_of_groups`). With two states there is no such check, and the image noise is all
+    that is stated.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def retrieve_fields(
                 part = part.closed_apart(mean_reference, states, owner)
             fields.values[chosen] = part.values
         errors = [closure_outside(fields.of(chosen), mean_reference, states) for chosen, states in groups]
-        noise, factors = noise_of_groups(errors)
+        noise, factors = noise_of_groups(errors, by_polarisation=True)
         variance = fields.stated(noise)
         for (chosen, _), factor in zip(groups, factors, strict=True):
             variance[chosen] *= factor
@@ -167,7 +167,7 @@ def retrieve_fields(
     )
     errors = [closure_outside(part, mean_reference, states) for part in (fields, blank)]
     # a sample's light is everywhere: what strays cannot be told from what is in proportion
-    noise = noise_scale(np.concatenate(errors, axis=1)[:3])
+    noise = noise_scale(np.concatenate(errors, axis=-1)[:3], by_polarisation=True)
     # what is wrong in proportion to the light is so in proportion to all of it, the reference spot's included
     return RecordingFields(
         fields.values - mean_reference,
@@ -205,7 +205,7 @@ def retrieve_sample(
     reference = calibration_fields.reference
     fields = _Run(method, before.fibrelets).amplitudes(images, "sample").in_phase_with(reference)
     fields = fields.closed(reference, states, None).closed_over_the_facet(reference, states, before.fibrelets)
-    noise = noise_scale(closure_outside(fields, reference, states)[:3])
+    noise = noise_scale(closure_outside(fields, reference, states)[:3], by_polarisation=True)
     return replace(
         before,
         fields=fields.values - reference,

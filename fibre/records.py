@@ -301,18 +301,18 @@ class Fibrelets:
 class CalibrationFields:
     """Mode amplitudes of every calibration capture, relative to the reference spot.
 
-    fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape,
-    E|error|^2; both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation,
-    relative_error, stray: what the closure of the illumination states found beyond the image noise (1, 0 and 0 =
-    nothing; :class:`fibre.closure.NoiseScale`); ``variance`` contains them. inputs, points, grid, registration: as in
-    :class:`Calibration`. status: :class:`RetrievalStatus` of every capture (captures,), None where no retrieval was
-    made.
+    fields: complex (captures, 2, m), phase relative to the reference spot; variance: real, the same shape, E|error|^2;
+    both in the modes of ``fibrelets``. reference: complex (2, m), the reference spot alone. inflation (of H and V
+    alike, or of each), relative_error, stray: what the closure of the illumination states found beyond the image noise
+    (1, 0 and 0 = nothing; :class:`fibre.closure.NoiseScale`); ``variance`` contains them. inputs, points, grid,
+    registration: as in :class:`Calibration`. status: :class:`RetrievalStatus` of every capture (captures,), None where
+    no retrieval was made.
     """
 
     fields: np.ndarray = array(("capture", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     variance: np.ndarray = array(("capture", "polarisation", "fibrelet"), "photo-electrons/s")
     reference: np.ndarray = array(("polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
-    inflation: float = setting()
+    inflation: float | tuple[float, float] = setting()
     relative_error: float = setting()
     fibrelets: Fibrelets = array((), "1")
     inputs: Any = array(("input", "capture"), "1")
@@ -358,7 +358,7 @@ class RecordingFields:
     variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
     blank: np.ndarray = array(("state", "polarisation", "fibrelet"), "sqrt(photo-electrons/s)")
     blank_variance: np.ndarray = array(("state", "polarisation", "fibrelet"), "photo-electrons/s")
-    inflation: float = setting()
+    inflation: float | tuple[float, float] = setting()
     relative_error: float = setting()
     fibrelets: Fibrelets = array((), "1")
     illumination: np.ndarray = array(("polarisation", "state"), "1")

@@ -66,6 +66,24 @@ def test_the_noise_scale_is_found_within_its_own_error(inflation, relative):
     assert abs(mean[1] - relative) < 4 * error[1] + 2e-3
 
 
+def test_each_polarisation_has_its_own_inflation_and_both_one_relative_error():
+    u, count, generator = states(4), 4000, np.random.default_rng(9)
+    clean = np.stack([linear_fields(u, count) for _ in range(2)], 1)
+    stated = generator.uniform(1e-4, 1e-3, clean.shape)
+    true = np.array([8.0, 1.5])[:, None] * stated + 0.02**2 * np.abs(clean) ** 2
+    noisy = clean + np.sqrt(true) * complex_noise(generator, clean.shape)
+    errors = closure_errors(noisy, stated, u).swapaxes(1, 2).reshape(3, 2, -1)
+    scale = noise_scale(errors, by_polarisation=True)
+    np.testing.assert_allclose(scale.inflation, [8.0, 1.5], rtol=0.06)
+    assert scale.relative_error == pytest.approx(0.02, rel=0.06)
+    assert scale.expected(errors).shape == errors[0].shape
+    # one for both believes H too much and V too little
+    both = noise_scale(errors.reshape(3, -1)).inflation
+    assert 2 < both < 7
+    np.testing.assert_allclose(np.mean(scale.variance(clean, stated) / true, (0, 2)), 1, atol=0.06)
+    assert noise_scale(np.empty((3, 2, 0)), by_polarisation=True).inflation == (1.0, 1.0)
+
+
 def test_two_states_change_nothing():
     u = states(2)
     errors = closure_errors(linear_fields(u, 30), np.ones((2, 30)), u)

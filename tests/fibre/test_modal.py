@@ -6,7 +6,7 @@ import scipy.spatial
 
 from fibre import Bundle, Defocus, Diversity, Fibrelets, Modal, RetrievalStatus, angular_spectrum, retrieve
 from fibre.propagation import transfer_function
-from fibre.retrieval.modal.newton import Found, Problem, _State
+from fibre.retrieval.modal.newton import Found, Problem, _State, make_coupling, refine
 from fibre.retrieval.modal.start import make_neighbours, spreads, synchronise
 from fibre.retrieval.modal.views import coarse_images, make_views
 
@@ -181,6 +181,20 @@ def test_dark_fibrelets_are_dark():
     found = retrieve(scene.diversity(), Modal(FIBRELETS))
     assert error(found.field, scene.field) < 0.02
     assert np.all(np.isfinite(found.field))
+
+
+def test_lit_fibrelets_that_the_start_leaves_dark_are_found(near):
+    masks = transfer_function(FRAME, NEAR, BUNDLE.wavelength, PIXEL).astype(np.complex64)
+    views = make_views(FIBRELETS, masks, PIXEL, None)
+    _, radii = spreads(FIBRELETS, masks, PIXEL)
+    coupling = make_coupling(scipy.spatial.cKDTree(FIBRELETS.centres), views, radii)
+    problem = Problem(*(coarse_images(x.astype(np.float32), views.step) for x in (near.counts, 1 / near.variance)))
+    start = near.amplitudes.copy()
+    dark = np.argsort(np.abs(start))[-8:]
+    start[dark] = 0
+    found = refine(views, coupling, problem, Found(start, 0.0, np.ones(7)), 12, 8, 2e-3).amplitudes
+    turn = np.exp(1j * np.angle(np.vdot(found, near.amplitudes)))
+    assert np.linalg.norm((found * turn - near.amplitudes)[dark]) < 0.05 * np.linalg.norm(near.amplitudes[dark])
 
 
 def test_a_black_image_gives_a_black_field():

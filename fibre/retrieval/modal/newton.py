@@ -120,7 +120,8 @@ class _Preconditioner:
         """Turn to the phases of these amplitudes. Their sizes matter less: the first ones are factorised, and kept."""
         i, j = self.pairs.T
         count, size = len(amplitudes), np.abs(amplitudes)
-        self.turn = amplitudes / np.maximum(size, 1e-30)
+        # a mode that starts dark may still be lit: its phase is as good as any
+        self.turn = np.where(size > 0, amplitudes / np.maximum(size, 1e-30), 1)
         if self.phase is not None:
             return
         pull = np.bincount(i, self.strength * size[j] ** 2, count) + np.bincount(j, self.strength * size[i] ** 2, count)
