@@ -28,6 +28,8 @@ __all__ = [
 
 FAILED = 4.0  # squared closure errors over the expected, above which a group is not like the others
 
+SETTLED = 1e-4  # relative change of the expected closure errors at which the noise is found
+
 WINDOW = 5.0  # fibrelets: width of the windows in which captures are closed apart
 GAIN = 0.02  # by which they must close better
 
@@ -254,6 +256,8 @@ def noise_scale(errors: np.ndarray, by_polarisation: bool = False) -> NoiseScale
     for _ in range(30):
         expected = stated + factors @ terms
         factors, _ = scipy.optimize.nnls((terms / expected).T, (squared - stated) / expected)
+        if np.all(np.abs(stated + factors @ terms - expected) <= SETTLED * expected):
+            break
     inflation = tuple((1 + factors[: len(own)]).tolist())
     return NoiseScale(inflation if by_polarisation else inflation[0], *np.sqrt(factors[len(own) :]).tolist())
 
