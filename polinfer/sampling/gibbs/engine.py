@@ -212,20 +212,22 @@ def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     ``sums`` ``(batches, 2, invariants, chains, pixels)`` of batches of ``length`` draws. The effective number comes
     from the variance of the batch means.
     """
-    means = sums[:, 0] / length
-    batches, chains = means.shape[0], means.shape[2]
-    n = batches * length
-    within = sums[:, 1].sum(0) / n - (sums[:, 0].sum(0) / n) ** 2  # (invariants, chains, pixels)
-    half = max(batches // 2, 1)
-    halves = np.stack([means[:half].mean(0), means[-half:].mean(0)])  # (2, invariants, chains, pixels)
-    variance = np.maximum(within.mean(axis=1), 0)
-    spread = halves.swapaxes(0, 1).reshape(halves.shape[1], -1, halves.shape[-1]).var(axis=1, ddof=1)
+    firsts, (batches, invariants, chains, pixels) = sums[:, 0], sums[:, 0].shape
+    n, half = batches * length, max(batches // 2, 1)
     size = half * length
+    # the sums are about a centre near the mean, so that differences of squares are exact enough
+    halves = np.stack([firsts[:half].sum(0), firsts[-half:].sum(0)]) / size  # (2, invariants, chains, pixels)
+    middle = firsts[half : batches - half].sum(0) if batches != 2 * half else 0.0
+    whole = (halves.sum(0) * size + middle) / n if batches > 1 else halves[0]
+    within = sums[:, 1].sum(0) / n - whole**2  # (invariants, chains, pixels)
+    variance = np.maximum(within.mean(axis=1), 0)
+    spread = halves.swapaxes(0, 1).reshape(invariants, -1, pixels).var(axis=1, ddof=1)
     still = variance <= 1e-12 * np.max(variance, axis=0, initial=1e-30)  # what a fixed parameter makes constant
     with np.errstate(divide="ignore", invalid="ignore"):
         r_hat = np.sqrt((size - 1) / size + spread / variance)
-        scatter = np.moveaxis(means, 1, 0).reshape(means.shape[1], -1, means.shape[-1])
-        total = scatter.var(axis=1, ddof=1) * length
+        count = batches * chains
+        squares = np.einsum("bicp,bicp->ip", firsts, firsts) / length**2  # of the batch means
+        total = np.maximum(squares - count * whole.mean(1) ** 2, 0) / (count - 1) * length
         effective = chains * n * (variance + spread) / np.maximum(total, 1e-300)
     r_hat = np.where(still, 1.0, r_hat)
     effective = np.where(still, chains * n, np.minimum(effective, 2 * chains * n))
