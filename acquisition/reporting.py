@@ -94,6 +94,10 @@ def write_report(
     folder = Path(folder)
     simulations, draws = integer("simulations", simulations, low=0), integer("draws", draws, low=4)
     measurement, fitted = _record(folder, "measurement.nc", Measurement), _record(folder, "fit.nc", Fit)
+    if labels is not None:  # before minutes of draws
+        labels = np.broadcast_to(np.asarray(labels), np.shape(fitted.status))
+        if not {0, 1} <= set(np.unique(labels).tolist()):
+            raise ValueError(f"labels must hold the regions 0 and 1, got {np.unique(labels).tolist()[:9]}.")
     sections = [
         _summary(fitted, notes),
         *_maps(fitted, measurement, pixel_size),
@@ -278,13 +282,10 @@ def _texture(fitted: Fit, pixel_size: float | None) -> list[_Section]:
     return [section]
 
 
-def _contrast(fitted: Fit, labels: Any, rng: int) -> list[_Section]:
+def _contrast(fitted: Fit, labels: np.ndarray | None, rng: int) -> list[_Section]:
     """Of regions 0 and 1, parameter by parameter; groups of pixels are drawn again, as neighbours are alike."""
     if labels is None:
         return []
-    labels = np.broadcast_to(np.asarray(labels), np.shape(fitted.status))
-    if not {0, 1} <= set(np.unique(labels).tolist()):
-        raise ValueError("labels must hold the regions 0 and 1.")
     groups = contrast.tiles(labels.shape, max(2, min(labels.shape[-2:]) // 4))
     rows: list[list[Any]] = []
     for name in Parameters._fields:

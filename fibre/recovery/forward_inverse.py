@@ -60,7 +60,7 @@ class ForwardInverse(RowByRow):
 
     window: float = 27e-6
     strength: float = 1.0
-    between: float = 0.1
+    between: float = 0.01
 
     def __post_init__(self) -> None:
         real_number("window", self.window, above=0)
