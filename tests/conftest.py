@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+# Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
+# otherwise, but for tests that compute longer than they compile; the processes of a run share what they compile.
+OPTIMISED = os.environ.get("POLINFER_TEST_OPTIMISED", "0") != "0"
+# XLA's older emitter of fused loops compiles in a third of the time. An unknown flag would end the process: named for
+# the versions of JAX that are known to have it, and set before the first use of JAX, when XLA reads its flags.
+if not OPTIMISED and version("jaxlib").startswith("0.10."):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 # The library never decides about precision; its tests run in double unless told otherwise.
 jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != "0")
 # The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way.
 BLAS = threadpool_limits(1, user_api="blas")
-# Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
-# otherwise, but for tests that compute longer than they compile; the processes of a run share what they compile.
-OPTIMISED = os.environ.get("POLINFER_TEST_OPTIMISED", "0") != "0"
 COMPUTES = ("fibre", "test_streaming.py", "test_demo.py")  # folders and files
 jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
