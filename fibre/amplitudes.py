@@ -17,8 +17,6 @@ from polinfer.storage import array
 
 __all__ = ["CaptureAmplitudes", "closure_outside", "mean_reference_of"]
 
-DARK = 1e-4  # of the reference spot's strongest fibrelet: those that have less are dark
-
 
 @dataclass(frozen=True)
 class CaptureAmplitudes:
@@ -100,10 +98,9 @@ def _reference_region(reference: np.ndarray) -> np.ndarray:
 
 
 def closure_outside(fields: CaptureAmplitudes, reference: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """Closure errors (4, 2, count) of both polarisations where the reference spot is dark: its light does not follow
-    the states, and what a turned capture leaves of it no noise explains."""
-    power = (np.abs(reference) ** 2).sum(0)
-    outside = power <= DARK * power.max()
+    """Closure errors (4, 2, count) of both polarisations outside the reference spot, whose light does not follow the
+    states."""
+    outside = ~_reference_region(reference)
     values, variance = fields.values[..., outside], fields.variance[..., outside]
     squared, stated, _ = closure_errors(values - reference[:, outside], variance, states)
     _, _, seen = closure_errors(values, variance, states)

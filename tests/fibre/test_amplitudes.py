@@ -41,13 +41,3 @@ def test_the_scene_is_turned_and_the_spot_is_not(scene):
                      (captures, captures.closed_over_the_facet(reference, STATES, fibrelets)))  # fmt: skip
     assert after < 0.3 * before
     assert lit.sum() > 1000
-
-
-def test_fibrelets_with_any_of_the_spots_light_do_not_judge_the_closure(scene):
-    _, reference, _, captures = scene
-    turned = captures.values.copy()
-    turned[1] += reference * (np.exp(0.1j) - 1)  # the spot of one capture has another phase, the scene has not
-    noises = [noise_scale(closure_outside(c, reference, STATES)[:3], by_polarisation=True) for c in
-              (captures, CaptureAmplitudes(turned, captures.variance, captures.status, captures.most))]  # fmt: skip
-    assert noises[1].relative_error == pytest.approx(noises[0].relative_error, rel=0.05)
-    np.testing.assert_allclose(noises[1].inflation, noises[0].inflation, rtol=0.05)
