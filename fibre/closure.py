@@ -27,7 +27,6 @@ __all__ = [
 ]
 
 FAILED = 4.0  # squared closure errors over the expected, above which a group is not like the others
-
 SETTLED = 1e-4  # relative change of the expected closure errors at which the noise is found
 
 WINDOW = 5.0  # fibrelets: width of the windows in which captures are closed apart

@@ -145,6 +145,7 @@ def test_the_coupling_profile_is_the_mean_power_against_distance(standard):
     assert profile(np.array([reach * 1.001]))[0] <= 1e-3 * profile.power[0]
 
 
+@pytest.mark.slow  # sparse points by another plan; every other test of the profile has them dense
 def test_spots_far_apart_have_the_same_coupling_profile(standard):
     """One spot for the whole bundle: most fibrelets see nothing, and must not blur what the near ones say."""
     far = scene(grid=(3, 3), stride=3, radius=100e-6, reference=(0.0, 95e-6), pitch=60e-6)
