@@ -264,14 +264,15 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
 
 
 def unmeasured(fields: CalibrationFields) -> np.ndarray:
-    r"""Power on each fibrelet, (m,), of light that enters where no spot was, as bright as the spots' own.
+    r"""Power on each fibrelet, (m,), of light that enters where no spot was, as an even light of the whole facet would.
 
     The facet has more fibrelets than points where the points are far apart: with n fibrelets to a point, light has n
     dimensions there and the calibration has seen one. What comes of the others is known on average,
 
-    .. math:: (1 - 1/n) \sum_l \tau^2(|r_k - r_l|)
+    .. math:: \frac{1 - 1/n}{n^2} \sum_l \tau^2(|r_k - r_l|)
 
-    over all fibrelets l, with the :func:`coupling_profile`. 0 where points are as dense as fibrelets.
+    over all fibrelets l, with the :func:`coupling_profile`: an even light is the sum of spots at all points, a spot's
+    amplitude spread over n fibrelets. 0 where points are as dense as fibrelets.
     """
     centres, positions = fields.fibrelets.centres, positions_on_camera(fields)
     if len(positions) < 2:
@@ -279,7 +280,8 @@ def unmeasured(fields: CalibrationFields) -> np.ndarray:
     tree, profile = scipy.spatial.cKDTree(centres), coupling_profile(fields)
     # circles as large as the square cell of a point
     around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
-    share = max(0.0, 1 - 1 / max(float(around.mean()), 1.0))
+    count = max(float(around.mean()), 1.0)
+    share = (1 - 1 / count) / count**2
     pairs = tree.sparse_distance_matrix(tree, profile.reach(FAINT), output_type="coo_matrix")
     return share * np.bincount(pairs.row, profile(pairs.data), len(centres))
 

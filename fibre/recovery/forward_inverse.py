@@ -52,15 +52,15 @@ class ForwardInverse(RowByRow):
     Parameters
     ----------
     window: metres, side of the square of fibrelets that a row may use. strength: >= 0, 1 is the noise's own. between:
-    beta, >= 0; 1 is the light of an evenly lit sample that has nothing in common with that at the points, 0: light at
-    the points alone.
+    beta, >= 0, in units of an even light of the whole facet that had nothing in common with that at the points; a real
+    one has much in common with it, and is smooth. 0: light at the points alone.
 
     Source: errors-in-variables ridge regression; the paper's window is the spacing of parallel spots, 68.2 um.
     """
 
     window: float = 27e-6
     strength: float = 1.0
-    between: float = 0.01
+    between: float = 0.1
 
     def __post_init__(self) -> None:
         real_number("window", self.window, above=0)

@@ -165,7 +165,7 @@ def test_what_light_between_the_points_puts_on_fibrelets_is_the_sum_of_the_profi
     away = np.hypot(*np.moveaxis(sparse.points[:, None] - centres, -1, 0))
     cell = np.count_nonzero(away < 7.6e-6 / np.sqrt(np.pi)) / 36
     assert cell == pytest.approx(7.6**2 / (np.sqrt(3) / 2 * 4.5**2), rel=0.1)
-    np.testing.assert_allclose(unmeasured(sparse), (1 - 1 / cell) * total, rtol=1e-6)
+    np.testing.assert_allclose(unmeasured(sparse), (1 - 1 / cell) / cell**2 * total, rtol=1e-6)
     # a fibrelet to a point: all is measured
     assert np.max(unmeasured(standard.calibration(1e-3, 0))) < 0.05 * total.max()
     assert np.all(unmeasured(one_point(standard)) == 0)
