@@ -264,15 +264,15 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
 
 
 def unmeasured(fields: CalibrationFields) -> np.ndarray:
-    r"""Power on each fibrelet, (m,), of light that enters where no spot was, as an even light of the whole facet would.
+    r"""Power on each fibrelet, (m,), of light that enters where no spot was, in proportion to an even light's.
 
     The facet has more fibrelets than points where the points are far apart: with n fibrelets to a point, light has n
     dimensions there and the calibration has seen one. What comes of the others is known on average,
 
     .. math:: \frac{1 - 1/n}{n^2} \sum_l \tau^2(|r_k - r_l|)
 
-    over all fibrelets l, with the :func:`coupling_profile`: an even light is the sum of spots at all points, a spot's
-    amplitude spread over n fibrelets. 0 where points are as dense as fibrelets.
+    over all fibrelets l, with the :func:`coupling_profile`: an even light is the sum of spots at all points, and
+    its amplitude on a fibrelet falls as the points' density, 1/n. 0 where points are as dense as fibrelets.
     """
     centres, positions = fields.fibrelets.centres, positions_on_camera(fields)
     if len(positions) < 2:

@@ -1,6 +1,6 @@
 """How wrong the retrieved fields are, from the data alone: the closure of the illumination states.
 
-In: fields of the same scene in n known states, with the variance that the image noise explains. Out: two numbers that
+In: fields of the same scene in n known states, with the variance that the image noise explains. Out: the numbers that
 turn that variance into the one the closure errors show. Called by ``retrieve_fields``.
 """
 

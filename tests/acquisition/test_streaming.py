@@ -84,7 +84,6 @@ def test_a_stream_that_is_left_stops_its_bench():
     assert series.count == count
 
 
-@pytest.mark.slow  # calibrates a fibre; its parts have tests of their own
 def test_a_fibre_is_streamed_as_its_recordings_are_reconstructed(tmp_path):
     """Through images, retrieval and inverse matrix; the later frames retrieve the sample alone."""
     from acquisition import SimulatedBench

@@ -145,7 +145,6 @@ def test_the_coupling_profile_is_the_mean_power_against_distance(standard):
     assert profile(np.array([reach * 1.001]))[0] <= 1e-3 * profile.power[0]
 
 
-@pytest.mark.slow  # sparse points by another plan; every other test of the profile has them dense
 def test_spots_far_apart_have_the_same_coupling_profile(standard):
     """One spot for the whole bundle: most fibrelets see nothing, and must not blur what the near ones say."""
     far = scene(grid=(3, 3), stride=3, radius=100e-6, reference=(0.0, 95e-6), pitch=60e-6)
@@ -169,6 +168,16 @@ def test_what_light_between_the_points_puts_on_fibrelets_is_the_sum_of_the_profi
     # a fibrelet to a point: all is measured
     assert np.max(unmeasured(standard.calibration(1e-3, 0))) < 0.05 * total.max()
     assert np.all(unmeasured(one_point(standard)) == 0)
+
+
+def test_an_even_light_made_of_spots_at_all_points_falls_as_their_density_on_every_fibrelet(standard):
+    bundle, powers, pitches = standard.bundle, [], np.array([2.0e-6, 2.5e-6])
+    inner = np.hypot(*bundle.centres.T) < 8e-6
+    for pitch in pitches:
+        side = np.arange(-20, 21) * pitch
+        places = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+        powers.append(np.asarray(bundle.launch(places, 2.5e-6).sum(1)).ravel()[inner] ** 2)
+    np.testing.assert_allclose(powers[0] / powers[1], (pitches[1] / pitches[0]) ** 4, rtol=0.01)
 
 
 def one_point(standard):

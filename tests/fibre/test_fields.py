@@ -130,7 +130,6 @@ def test_a_known_tilt_is_taken_out_of_every_capture(bench):
     assert np.linalg.norm(tilted.blank - usual.blank) > 0.1 * np.linalg.norm(usual.blank)
 
 
-@pytest.mark.slow  # a calibration and a recording anew; benchmarks.chain judges six more
 def test_a_tilt_that_walks_is_followed_by_references_and_closure(bench, tmp_path):
     scene = replace(bench.scene, tilt_walk=3e3, piston_walk=0.3, image_time=0.9)
     moving = SimulatedBench(scene, rng=3)

@@ -217,8 +217,7 @@ def convergence(sums: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     size = half * length
     # the sums are about a centre near the mean, so that differences of squares are exact enough
     halves = np.stack([firsts[:half].sum(0), firsts[-half:].sum(0)]) / size  # (2, invariants, chains, pixels)
-    middle = firsts[half : batches - half].sum(0) if batches != 2 * half else 0.0
-    whole = (halves.sum(0) * size + middle) / n if batches > 1 else halves[0]
+    whole = firsts.sum(0) / n
     within = sums[:, 1].sum(0) / n - whole**2  # (invariants, chains, pixels)
     variance = np.maximum(within.mean(axis=1), 0)
     spread = halves.swapaxes(0, 1).reshape(invariants, -1, pixels).var(axis=1, ddof=1)
