@@ -12,7 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from acquisition.contracts import AnyBench, Frame, bracketed
-from acquisition.exposure import Merged, MergeRule, merge_views
+from acquisition.exposure import MergeRule
+from acquisition.merging import Merged, merge_views
 from acquisition.plan import Step, Views
 from fibre import Images
 

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from acquisition.exposure import InverseVariance, merge_exposures
+from acquisition.exposure import InverseVariance
+from acquisition.merging import merge_exposures
 from benchmarks.results import Results, median_seconds
 from fibre import (
     Accelerated,

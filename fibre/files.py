@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from fibre.ageing import Staleness
 from fibre.bundle import Bundle
 from fibre.drift import Drift
 from fibre.imaging import TransmissionImage
@@ -21,11 +22,11 @@ from fibre.records import (
     Retrieved,
 )
 from fibre.registration import Registration
-from fibre.staleness import Staleness
 from polinfer import storage
 from polinfer.files import TYPES as BELOW
+from polinfer.storage import save
 
-__all__ = ["TYPES", "load"]
+__all__ = ["TYPES", "load", "save"]
 
 TYPES: tuple[type, ...] = (
     Bundle,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from acquisition import Bracket, InverseVariance, LongestUnsaturated, merge_exposures
-from acquisition.exposure import merge_views
+from acquisition.merging import merge_views
 
 GAIN, READ, DARK, FULL = 2.0, 3.0, 20.0, 4095
 TIMES = 0.1 / 2.0 ** np.arange(9)
