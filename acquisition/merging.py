@@ -47,6 +47,7 @@ def merge_exposures(frames: Any, exposures: Any, full_scale: int, rule: MergeRul
     ------
     TypeError: frames are not integers, or another rule. ValueError: shapes, exposure times, counts above full scale.
 
+    >>> from acquisition import InverseVariance
     >>> frames = np.array([[[255, 40]], [[100, 20]]], np.uint8)
     >>> merged = merge_exposures(frames, [0.2, 0.1], 255, InverseVariance(gain=2.0, read_noise=1.0))
     >>> merged.radiance.round(1).tolist()
