@@ -27,9 +27,31 @@ def test_every_public_name_is_there_and_is_what_its_module_defines(name):
         _ = package.no_such_name
 
 
-def test_a_device_s_worker_does_not_wait_for_the_compiler():
-    asked = "import sys, acquisition.worker; from acquisition import Usb3VisionCamera; print(*sys.modules)"
+def loaded_by(*modules):
+    """What a new process has loaded after it has imported these."""
+    asked = f"import sys, {', '.join(modules)}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert {"acquisition.usb.camera", "numpy"} <= loaded
-    assert not {"jax", "fibre.records", "polinfer.model", "matplotlib"} & loaded
+    assert set(modules) <= set(done.stdout.split())
+    return set(done.stdout.split())
+
+
+def test_a_device_s_worker_does_not_wait_for_the_compiler():
+    assert not {"jax", "matplotlib"} & loaded_by("acquisition.worker", "acquisition.usb.camera")
+
+
+@pytest.mark.parametrize(
+    ("modules", "forbidden"),
+    [
+        (("polinfer.checks", "polinfer.storage"), ("polinfer.records", "polinfer.model", "polinfer.fitting", "fibre.")),
+        (
+            ("acquisition.contracts", "acquisition.exposure", "acquisition.merging", "acquisition.plan",
+             "acquisition.recording"),
+            ("fibre.", "polinfer.records", "polinfer.model"),
+        ),
+        (("fibre.records", "fibre.fields", "fibre.calibration"), ("acquisition.",)),
+        (("polinfer.fitting", "polinfer.sampling", "polinfer.files"), ("fibre.", "acquisition.")),
+    ],
+)  # fmt: skip
+def test_what_stands_below_does_not_load_what_stands_above(modules, forbidden):
+    """A name asked for of a whole package hides from the import contracts which module it comes from."""
+    assert not [name for name in loaded_by(*modules) if name.startswith(forbidden)]
