@@ -61,12 +61,15 @@ class Evolution:
     def apply(self, amplitudes: np.ndarray, sign: int = 1) -> np.ndarray:
         """exp(i sign K) times the columns of ``amplitudes``, complex128 (k, columns)."""
         first, second, *rest = self.coefficients(sign)
-        before, now = amplitudes.astype(complex), self.scaled @ amplitudes
-        total = first * before + second * now
+        before = amplitudes.astype(complex)
+        now = self.scaled @ before
+        total, twice = first * before + second * now, 2 * self.scaled
         for coefficient in rest:
-            before, now = now, 2 * (self.scaled @ now) - before
+            following = twice @ now
+            following -= before
+            before, now = now, following
             total += coefficient * now
-        return np.asarray(total)
+        return total
 
     def apply_jax(self, amplitudes: jax.Array, sign: int = 1, rows: tuple[Any, Any] | None = None) -> jax.Array:
         """The same as :meth:`apply` in JAX, in the precision of ``amplitudes``; differentiable. ``rows``: :attr:`rows`

@@ -7,6 +7,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
+import pytest
+from filelock import FileLock
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
@@ -37,3 +39,14 @@ settings.load_profile(os.environ.get("POLINFER_FUZZ", "quick"))
 def pytest_runtest_setup(item):
     plain = not OPTIMISED and not {item.path.name, item.path.parent.name} & set(COMPUTES)
     jax.config.update("jax_disable_most_optimizations", plain)
+
+
+@pytest.fixture(scope="session")
+def bench(tmp_path_factory, request):
+    """The small simulated bench, captured and retrieved once for all processes of a run."""
+    from tests.fibre.benches import small  # XLA has its flags by now
+
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if hasattr(request.config, "workerinput") else base
+    with FileLock(shared / "bench.lock"):
+        return small(shared / "bench")

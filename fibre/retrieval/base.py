@@ -176,11 +176,12 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
 
 
 class Measured(NamedTuple):
-    """amplitudes, weights (b, m, y, x); best: the variance of weight 1, (b,), None where it is unknown; noise (b,)."""
+    """amplitudes, weights (b, m, y, x); expected: the misfit that noise alone leaves, (b,), None where the noise is
+    unknown; noise: of the amplitudes over the amplitudes, (b,)."""
 
     amplitudes: jax.Array
     weights: jax.Array
-    best: jax.Array | None
+    expected: jax.Array | None
     noise: jax.Array
 
 
@@ -203,7 +204,9 @@ def measured_amplitudes(intensities: jax.Array | np.ndarray, variance: jax.Array
     weights = jnp.where(usable, best[:, None, None, None] / spread, 0)
     power = (weights * amplitudes**2).sum((1, 2, 3))
     noise = jnp.sqrt(best * usable.sum((1, 2, 3)) / jnp.maximum(power, 1e-30))
-    return Measured(amplitudes, weights, best, noise)
+    # sum of w = sum of best / spread: pixels of equal weight would each have this variance
+    expected = best * usable.sum((1, 2, 3)) / weights.sum((1, 2, 3))
+    return Measured(amplitudes, weights, expected, noise)
 
 
 @jax.jit
@@ -232,13 +235,11 @@ def judged(field: np.ndarray, measured: Measured, masks: Any) -> tuple[np.ndarra
 
 @jax.jit
 def _judged(field: jax.Array, measured: Measured, masks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    amplitudes, weights, best, _ = measured
+    amplitudes, weights, expected, _ = measured
     images = amplitudes.shape[1]
     left = _misfit(field, amplitudes, weights, masks)
-    if best is None:
+    if expected is None:
         # nothing known of the noise: what the best fit leaves over is all there is to go by
         return 2 * left / images, jnp.zeros(len(field), bool)
-    # sum of w = sum of best / spread: pixels of equal weight would each have this variance
-    expected = best * (weights > 0).sum((1, 2, 3)) / weights.sum((1, 2, 3))
     slack = 0.01 * (weights * amplitudes**2).sum((1, 2, 3)) / weights.sum((1, 2, 3))
     return 2 * expected / images, left > 2 * expected + slack

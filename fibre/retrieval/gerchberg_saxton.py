@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import scipy.ndimage
 
 from fibre.retrieval.base import RetrievalMethod, Solution, Stack, misfit
 from polinfer.checks import integer, real_number
+from polinfer.threads import each, piece
 
 __all__ = ["GerchbergSaxton"]
 
@@ -30,8 +32,9 @@ class GerchbergSaxton(RetrievalMethod):
     variance of the amplitudes: the planes' noise is averaged, and dark pixels, whose square root is mostly noise,
     count for little. Pixels without a usable measurement keep their own amplitude.
 
-    A field that still moves, or fits its images 1.5 times worse than the others of its batch, has stagnated: it is
-    started again from a smooth random phase, ``restarts`` times at most, and the better fit is kept.
+    A field that still moves and is not as near to its images as twice their noise, or that fits them 1.5 times worse
+    than the others of its batch, has stagnated: it is started again from a smooth random phase, ``restarts`` times at
+    most, and the better fit is kept.
 
     Parameters
     ----------
@@ -59,48 +62,66 @@ class GerchbergSaxton(RetrievalMethod):
 
     def solve(self, stack: Stack) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
-        amplitudes, weights, masks, noise = stack.amplitudes, stack.weights, stack.masks, stack.noise
+        noise, shape = stack.noise, stack.intensities.shape[-2:]
         # the planes' noise keeps the field moving by a few per cent of it, however long one waits
         tolerance = np.asarray(np.maximum(self.tolerance, 0.1 * noise) * (self.tolerance > 0), np.float32)
-        settings = (self.iterations, self.averaging)
-        coarse = self.coarsening if all(n % (2 * self.coarsening) == 0 for n in amplitudes.shape[-2:]) else 1
-        flat = np.zeros(amplitudes.shape[-2:], amplitudes.dtype)
-        field, change, count = _run(amplitudes, weights, masks, flat, tolerance, *settings, coarse)
-        spent = np.full(len(field), count + self.averaging)
-        left = np.array(misfit(field, amplitudes, weights, masks))
+        coarse = self.coarsening if all(n % (2 * self.coarsening) == 0 for n in shape) else 1
+        found = self._run(stack, np.arange(len(noise)), tolerance, np.zeros(shape, np.float32), coarse)
+        field, change, spent, left = found
+        # planes that contradict each other keep a field moving for ever: it is found where noise explains what is left
+        explained = np.zeros(len(noise)) if stack.measured.expected is None else 2 * np.asarray(stack.measured.expected)
         for restart in range(self.restarts):
             # a stagnated field leaves several times the misfit of its neighbours; noise differs far less
-            suspect = (change > tolerance) | (left > 1.5 * np.median(left))
-            if not suspect.any():
+            chosen = np.flatnonzero(((change > tolerance) & (left > explained)) | (left > 1.5 * np.median(left)))
+            if len(chosen) == 0:
                 break
-            phase = np.random.default_rng(restart).uniform(-np.pi, np.pi, size=flat.shape)
+            phase = np.random.default_rng(restart).uniform(-np.pi, np.pi, size=shape)
             # correlated over a few pixels, several radians deep
             smooth = scipy.ndimage.gaussian_filter(phase, 4.0, mode="wrap") * 20
-            chosen = np.flatnonzero(suspect)
-            # code is compiled for a shape: pad to a power of two, so that few shapes occur
-            padded = np.resize(chosen, 1 << (len(chosen) - 1).bit_length())
-            again, moved, count = _run(
-                amplitudes[padded], weights[padded], masks, smooth, tolerance[padded], *settings, 1
-            )
-            other = misfit(again, amplitudes[padded], weights[padded], masks)
-            for i, k in enumerate(chosen):
-                if other[i] < left[k]:
-                    field[k], change[k], left[k] = again[i], moved[i], other[i]
-            spent[chosen] += count + self.averaging
+            again = self._run(stack, chosen, tolerance, smooth, 1)
+            better = again.left < left[chosen]
+            for old, new in zip((field, change, left), (again.field, again.change, again.left), strict=True):
+                old[chosen[better]] = new[better]
+            spent[chosen] += again.sweeps
         return Solution(field, change <= np.maximum(tolerance, 1e-2), spent)
 
+    def _run(self, stack: Stack, chosen: np.ndarray, tolerance: np.ndarray, phase: np.ndarray, coarse: int) -> _Found:
+        """``chosen`` fields from ``phase`` in the first plane: on a processor one by one, on all cores."""
+        size = min(piece(1, 64), 1 << (len(chosen) - 1).bit_length())
+        # code is compiled for a shape: pieces are filled up, so that few shapes occur
+        filled = np.resize(chosen, -(-len(chosen) // size) * size)
+        found: list[_Found] = [None] * (len(filled) // size)  # type: ignore[list-item]
 
-def _run(
-    amplitudes: np.ndarray,
-    weights: np.ndarray,
-    masks: np.ndarray,
+        def part(k: int) -> None:
+            some = filled[k * size : (k + 1) * size]
+            images = (stack.amplitudes[some], stack.weights[some], stack.masks)
+            spectrum, change, sweeps = _spectra(images, phase, tolerance[some], self.iterations, self.averaging, coarse)
+            field = np.array(jnp.fft.ifft2(spectrum))
+            found[k] = _Found(field, np.array(change), np.array(sweeps) + self.averaging, misfit(field, *images))
+
+        each(part, range(len(found)))
+        return _Found(*(np.concatenate(values)[: len(chosen)] for values in zip(*found, strict=True)))
+
+
+class _Found(NamedTuple):
+    """field (b, y, x); of each its last relative change, its sweeps, and the mean squared misfit it leaves, (b,)."""
+
+    field: np.ndarray
+    change: np.ndarray
+    sweeps: np.ndarray
+    left: np.ndarray
+
+
+def _spectra(
+    images: tuple[np.ndarray, np.ndarray, np.ndarray],
     phase: np.ndarray,
     tolerance: np.ndarray,
     iterations: int,
     averaging: int,
     coarse: int,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Fields, their last relative change and the number of sweeps, from a phase in the first plane."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What :func:`_solve` returns, from a phase in the first plane; ``images``: amplitudes, weights, masks."""
+    amplitudes, weights, masks = images
     first = np.fft.fft2(amplitudes[:, 0] * np.exp(1j * phase)) * np.conj(masks[0])
     if coarse > 1:
         # every second pixel samples the same field, and low frequencies alone make a good start at less cost
@@ -112,8 +133,7 @@ def _run(
         )
         first = np.zeros_like(first)
         first[place] = np.asarray(spectrum) * coarse**2
-    spectrum, change, count = _solve(amplitudes, weights, masks, first, tolerance, iterations, averaging)
-    return np.array(jnp.fft.ifft2(spectrum)), np.array(change), int(count)
+    return _solve(amplitudes, weights, masks, first, tolerance, iterations, averaging)
 
 
 def _middle(count: int, coarse: int) -> np.ndarray:
@@ -138,7 +158,8 @@ def _solve(
     iterations: int,
     averaging: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Spectra from the spectra ``first``, the last relative change, and the number of sweeps."""
+    """Spectra from the spectra ``first``, the last relative change, and the number of sweeps; every field stops for
+    itself."""
     images = masks.shape[0]
     back = jnp.conj(masks)
     # what a mask does not pass, its plane says nothing about: it is left as it is
@@ -152,21 +173,26 @@ def _solve(
         return spectrum
 
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        spectrum, _, count = carry
-        new = sweep(spectrum)
+        spectrum, change, count = carry
+        moves = change > tolerance
+        new = jnp.where(moves[:, None, None], sweep(spectrum), spectrum)
         power = jnp.sum(jnp.abs(new) ** 2, axis=(1, 2))
-        change = jnp.sqrt(jnp.sum(jnp.abs(new - spectrum) ** 2, axis=(1, 2)) / jnp.maximum(power, 1e-30))
-        return new, change, count + 1
+        moved = jnp.sqrt(jnp.sum(jnp.abs(new - spectrum) ** 2, axis=(1, 2)) / jnp.maximum(power, 1e-30))
+        return new, jnp.where(moves, moved, change), count + moves
 
     def unfinished(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        return (carry[2] < iterations) & jnp.any(carry[1] > tolerance)
+        return jnp.any((carry[2] < iterations) & (carry[1] > tolerance))
 
     def average(_: int, spectrum: jax.Array) -> jax.Array:
         view = jnp.fft.ifft2(spectrum[:, None] * masks)
         moved = jnp.fft.fft2(_project(view, amplitudes, weights)) * back
         return (moved + spectrum[:, None] * unseen).mean(1)
 
-    start = (first.astype(masks.dtype), jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype), jnp.array(0))
+    start = (
+        first.astype(masks.dtype),
+        jnp.full(len(amplitudes), jnp.inf, amplitudes.dtype),
+        jnp.zeros(len(amplitudes), int),
+    )
     spectrum, change, count = jax.lax.while_loop(unfinished, step, start)
     spectrum = jax.lax.fori_loop(0, averaging, average, spectrum)
     return spectrum, change, count

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import polinfer
-from acquisition import FibreImager, SamplePlan, capture, stream
+from acquisition import FibreImager, SamplePlan, SimulatedBench, capture, stream
 from fibre import ForwardInverse, reconstruct, recover, retrieve_fields
 from polinfer import ComplexGain, Model, phantoms
-from tests.fibre.benches import METHOD, SAMPLE, small
+from tests.fibre.benches import METHOD, SAMPLE
 
 STATES = np.stack([np.ones(3), np.exp(2j * np.pi * np.arange(3) / 3)]) / np.sqrt(2)
 
@@ -84,17 +84,14 @@ def test_a_stream_that_is_left_stops_its_bench():
     assert series.count == count
 
 
-def test_a_fibre_is_streamed_as_its_recordings_are_reconstructed(tmp_path):
+def test_a_fibre_is_streamed_as_its_recordings_are_reconstructed(bench, tmp_path):
     """Through images, retrieval and inverse matrix; the later frames retrieve the sample alone."""
-    from acquisition import SimulatedBench
-
-    made = small(tmp_path / "made")
-    inverse = recover(made.calibration_fields, ForwardInverse())
-    imager = FibreImager(SimulatedBench(made.scene, rng=3), inverse, METHOD)
+    inverse = recover(bench.calibration_fields, ForwardInverse())
+    imager = FibreImager(SimulatedBench(bench.scene, rng=3), inverse, METHOD)
     model = Model(gain=ComplexGain(1.0))
     found = list(stream(imager, SAMPLE, model, budget=60.0, period=0.0, frames=2))
-    fields = retrieve_fields(capture(SimulatedBench(made.scene, rng=3), SAMPLE, tmp_path / "run"), METHOD,
-                             made.calibration_fields.fibrelets)  # fmt: skip
+    fields = retrieve_fields(capture(SimulatedBench(bench.scene, rng=3), SAMPLE, tmp_path / "run"), METHOD,
+                             bench.calibration_fields.fibrelets)  # fmt: skip
     offline = reconstruct(inverse, fields)
     first = next(f for f in found if f.number == 0) if found[0].number == 0 else None
     if first is not None:

@@ -25,7 +25,9 @@ from fibre import (
     GerchbergSaxton,
     Recording,
     RecordingFields,
+    load,
     retrieve_fields,
+    save,
 )
 from polinfer import phantoms
 
@@ -59,7 +61,7 @@ class Small:
 
 
 def small(folder):
-    """Capture and retrieve everything once, in ``folder``."""
+    """Capture and retrieve everything once, in ``folder``; what is there already is taken from it."""
     bundle = Bundle.hexagonal(radius=20e-6, mode_spread=0.0, rng=0)
     camera = CameraModel(shape=(96, 96), pixel_size=0.72e-6, gain=4.0, read_noise=3.0, bits=12)
     scene = Scene(
@@ -69,7 +71,9 @@ def small(folder):
     bench = SimulatedBench(scene, rng=3)
     calibration, recording = calibrate(bench, PLAN, folder / "calibration"), capture(bench, SAMPLE, folder / "sample")
     fibrelets = Fibrelets(bundle.centres, 1.6e-6)
-    return Small(
-        scene, calibration, recording, retrieve_fields(calibration, METHOD, fibrelets),
-        retrieve_fields(recording, METHOD, fibrelets),
-    )  # fmt: skip
+
+    def fields(record, name):
+        path = folder / name
+        return load(path) if path.exists() else load(save(retrieve_fields(record, METHOD, fibrelets), path))
+
+    return Small(scene, calibration, recording, fields(calibration, "calibration.nc"), fields(recording, "sample.nc"))

@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.fibre.benches import small
 from tests.fibre.scenes import scene
 
 
@@ -10,9 +9,3 @@ from tests.fibre.scenes import scene
 def standard():
     """The synthetic scene of 109 fibrelets and 64 points."""
     return scene()
-
-
-@pytest.fixture(scope="session")
-def bench(tmp_path_factory):
-    """The small simulated bench, captured and retrieved."""
-    return small(tmp_path_factory.mktemp("bench"))

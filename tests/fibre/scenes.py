@@ -75,7 +75,7 @@ def scene(grid=(8, 8), stride=4, states=3, radius=25e-6, reference=(0.0, 22e-6),
     bundle = Bundle.hexagonal(radius=radius, rng=0)
     plan = CalibrationPlan(grid, pitch, stride=stride, states=states)
     launch = bundle.launch(plan.points, WAIST)
-    matrix = (bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray()
+    matrix = bundle.columns(scipy.sparse.block_diag([launch, launch])).toarray()
     spot = bundle.launch(np.array([reference]), WAIST).toarray()[:, 0]
     return Scene(bundle, plan, matrix, bundle.transmit(np.stack([spot, spot]) / np.sqrt(2)))
 

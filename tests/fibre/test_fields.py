@@ -203,7 +203,7 @@ def far_apart():
     bundle = Bundle.hexagonal(radius=36e-6, rng=3)
     plan = CalibrationPlan((4, 4), pitch=16e-6, stride=2)
     launch = bundle.launch(plan.points, 2.5e-6)
-    matrix = (bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray()
+    matrix = bundle.columns(scipy.sparse.block_diag([launch, launch])).toarray()
     clean = (matrix @ plan.inputs.toarray()).T.reshape(-1, 2, bundle.cores)
 
     def images(count):

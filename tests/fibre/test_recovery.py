@@ -110,7 +110,7 @@ def test_light_between_sparse_points_is_kept_out_and_costs_those_at_the_points_l
     finer = np.concatenate([points + offset for offset in offsets])
     launch = sparse.bundle.launch(finer, 3.8e-6)
     flat = np.repeat(np.eye(2), len(finer), axis=0)  # H alone, V alone
-    flat = (sparse.bundle.transfer @ scipy.sparse.block_diag([launch, launch])) @ flat
+    flat = sparse.bundle.columns(scipy.sparse.block_diag([launch, launch])) @ flat
     rough = complex_noise(np.random.default_rng(0), (72, 40))
     errors, mixed = {}, {}
     for between in (0.0, ForwardInverse().between):
@@ -224,7 +224,7 @@ def test_weighted_sums_are_exact_where_points_are_far_apart():
     far = scene(grid=(2, 2), stride=2, radius=30e-6)
     far = replace(far, plan=replace(far.plan, pitch=30e-6), reference=far.reference)
     launch = far.bundle.launch(far.plan.points, 2.5e-6)
-    far = replace(far, matrix=(far.bundle.transfer @ scipy.sparse.block_diag([launch, launch])).toarray())
+    far = replace(far, matrix=far.bundle.columns(scipy.sparse.block_diag([launch, launch])).toarray())
     inverse = recover(far.calibration(1e-6, 1), WeightedSum(window=20e-6))
     np.testing.assert_allclose(inverse.matrix @ far.matrix, np.eye(8), atol=2e-3)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fibre import Bundle, Defocus, Diversity, GerchbergSaxton, RetrievalStatus, retrieve
+from fibre.retrieval import gerchberg_saxton
 
 BUNDLE = Bundle.hexagonal(radius=15e-6, rng=0)
 PIXEL, FRAME = 0.72e-6, (72, 72)
@@ -127,14 +128,24 @@ def test_averaging_brings_the_error_down(bright, solved):
     assert errors(solved.field, bright.truth).mean() < 0.9 * errors(raw.field, bright.truth).mean()
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_the_batch_does_not_matter(bright, solved, batch):
-    settings = GerchbergSaxton(iterations=30, tolerance=0.0, restarts=0)  # nothing that a neighbour could decide
-    one, other = (retrieve(bright.defocus(), settings, batch=n).field for n in (batch, 4))
-    np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
-    # with the usual settings a neighbour decides when to stop, within the tolerance and below the noise
-    usual = retrieve(bright.defocus(), GerchbergSaxton(), batch=batch).field
-    assert np.all(errors(usual, solved.field) < 0.3 * bright.photon_limit)
+@pytest.mark.parametrize(("batch", "piece"), [(1, 1), (3, 64)])
+def test_a_field_is_the_same_in_any_company(bright, solved, monkeypatch, batch, piece):
+    """One by one, as on processors, or many in one array, as on accelerators, filled up to a power of two."""
+    monkeypatch.setattr(gerchberg_saxton, "piece", lambda processor, accelerator: min(piece, accelerator))
+    found = retrieve(bright.defocus(), GerchbergSaxton(), batch=batch)
+    np.testing.assert_allclose(found.field, solved.field, atol=1e-4 * np.abs(solved.field).max())
+    np.testing.assert_array_equal(found.iterations, solved.iterations)
+
+
+def test_a_moving_field_begins_again_only_where_noise_does_not_explain_its_images():
+    """Stopped after eight sweeps, the last of which moved most fields by more than the tolerance."""
+    data, early = stack(1e4, seed=3), GerchbergSaxton(iterations=8)
+    found = retrieve(data.defocus(), early)
+    assert np.count_nonzero(found.iterations == 8 + early.averaging) >= 2
+    assert np.all(found.iterations <= 8 + early.averaging)
+    assert np.all(errors(found.field, data.truth) < 2 * data.photon_limit)
+    wrong = retrieve(data.defocus(distances=1.3 * PLANES), early)
+    assert np.all(wrong.iterations == 3 * (8 + early.averaging))
 
 
 def test_leading_axes_are_fields(bright, solved):
