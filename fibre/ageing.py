@@ -237,8 +237,5 @@ def _sparse(old: np.ndarray, inputs: np.ndarray, outputs: np.ndarray, noise: flo
     size = np.abs(old)
     weights = 1 / (size / np.maximum(size.mean(1, keepdims=True), 1e-300) + SPARSE)
     delta = noise * np.sqrt(inputs.shape[1])
-    rows = [
-        basis_pursuit_denoise(inputs.T, row[:, None], delta, weights=weight, iterations=1000).x[:, 0]
-        for row, weight in zip(left, weights, strict=True)
-    ]
-    return np.asarray(scaled + np.stack(rows))
+    rows = basis_pursuit_denoise(inputs.T, left.T, delta, weights=weights.T, iterations=1000).x.T
+    return np.asarray(scaled + rows)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -228,7 +229,7 @@ class _Regressions:
 
     cores: (k,). chosen: (k, 2 q), indices of the inputs (h of the points, then v). root: (k, 2 q), the root of T, 0
     where padded. scaled: (k, 2 q, captures), T^1/2 X. weight: 1/var, (2, k, captures) for either polarisation of the
-    output. systems: :math:`G = 1 + T^{1/2} X \, \mathrm{diag}(1/\mathrm{var}) X^H T^{1/2}`, (2, k, 2 q, 2 q).
+    output.
     """
 
     cores: np.ndarray
@@ -236,7 +237,12 @@ class _Regressions:
     root: np.ndarray
     scaled: np.ndarray
     weight: np.ndarray
-    systems: np.ndarray
+
+    @cached_property
+    def systems(self) -> np.ndarray:
+        r""":math:`G = 1 + T^{1/2} X \, \mathrm{diag}(1/\mathrm{var}) X^H T^{1/2}`, (2, k, 2 q, 2 q)."""
+        products = (self.scaled * self.weight[:, :, None]) @ self.scaled.conj().swapaxes(-1, -2)
+        return np.asarray(products + np.eye(self.root.shape[1]))
 
 
 def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iterator[_Regressions]:
@@ -259,8 +265,7 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         chosen = np.where(root > 0, np.concatenate([points, points + count], axis=1), 2 * count)
         scaled = root[..., None] * inputs[chosen]
         weight = 1 / fields.variance[:, :, cores].transpose(1, 2, 0)
-        systems = (scaled * weight[:, :, None]) @ scaled.conj().swapaxes(-1, -2) + np.eye(root.shape[1])
-        yield _Regressions(cores, chosen, root, scaled, weight, systems)
+        yield _Regressions(cores, chosen, root, scaled, weight)
 
 
 def unmeasured(fields: CalibrationFields) -> np.ndarray:

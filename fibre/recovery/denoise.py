@@ -65,8 +65,8 @@ def basis_pursuit_denoise(
 
     Parameters
     ----------
-    matrix: complex or real (m, n). rhs: (m, k). delta: (k,) or one number, >= 0, in the unit of rhs. weights: (n,) > 0,
-    or None for 1. start: (n, k) to begin with, or None. tolerance: relative gap, > 0. iterations: most, >= 1.
+    matrix: complex or real (m, n). rhs: (m, k). delta: (k,) or one number, >= 0, in the unit of rhs. weights: > 0, (n,) or,
+    of every right-hand side its own, (n, k); None: 1. start: (n, k) to begin with, or None. tolerance: relative gap, > 0. iterations: most, >= 1.
 
     Raises
     ------
@@ -90,7 +90,9 @@ def basis_pursuit_denoise(
     count = wanted.shape[1]
     ball = np.broadcast_to(np.asarray(delta, float), (count,)) if np.ndim(delta) == 0 else delta
     ball = real_array("delta", ball, shape=(count,), low=0, finite=True).astype(float)
-    weight = np.ones(n) if weights is None else real_array("weights", weights, shape=(n,), above=0, finite=True)
+    shape = (n, count) if np.ndim(weights) == 2 else (n,)
+    weight = real_array("weights", np.ones(n) if weights is None else weights, shape=shape, above=0, finite=True)
+    weight = np.broadcast_to(weight if weight.ndim == 2 else weight[:, None], (n, count))
     tolerance, iterations = real_number("tolerance", tolerance, above=0), integer("iterations", iterations, low=1)
     before = None if start is None else complex_array("start", start, shape=(n, count), finite=True)
 
@@ -99,7 +101,7 @@ def basis_pursuit_denoise(
     x, gap, spent = np.zeros((n, count), complex), np.zeros(count), 0
     sought = np.flatnonzero(size > ball)
     if len(sought) and np.any(a):
-        problem = _Problem(a, b[:, sought] / size[sought], ball[sought] / size[sought], weight)
+        problem = _Problem(a, b[:, sought] / size[sought], ball[sought] / size[sought], weight[:, sought])
         first = None if before is None else before[:, sought] / size[sought]
         found, gap[sought], spent = problem.solve(first, tolerance, iterations)
         x[:, sought] = found * size[sought]
@@ -126,7 +128,7 @@ class _Problem:
         self.target = left[:, kept].conj().T @ rhs
         outside = np.linalg.norm(rhs - left[:, kept] @ self.target, axis=0)
         self.ball = np.sqrt(np.maximum(ball**2 - outside**2, 0))
-        self.weight = weight[:, None] / weight.max()
+        self.weight = weight / weight.max(0)
 
     def solve(self, start: np.ndarray | None, tolerance: float, iterations: int) -> tuple[np.ndarray, np.ndarray, int]:
         """Solutions, gaps, and iterations."""
@@ -158,7 +160,7 @@ class _Problem:
             u, v = u + x - z, v + ax - y
             if number % EVERY and number != iterations:
                 continue
-            feasible, gap = self._judged(z, -rho * v, target, ball)
+            feasible, gap = self._judged(z, -rho * v, target, ball, w)
             finished = gap <= tolerance if number < iterations else np.ones(len(active), bool)
             done[:, active[finished]], gaps[active[finished]] = feasible[:, finished], gap[finished]
             if finished.all():
@@ -172,18 +174,18 @@ class _Problem:
             rho, u, v = rho * change, u / change, v / change
             go = ~finished
             active, target, ball, rho = active[go], target[:, go], ball[go], rho[go]
-            z, y, u, v = z[:, go], y[:, go], u[:, go], v[:, go]
+            z, y, u, v, w = z[:, go], y[:, go], u[:, go], v[:, go], w[:, go]
         return done / self.scale, gaps, number
 
     def _judged(
-        self, z: np.ndarray, dual: np.ndarray, target: np.ndarray, ball: np.ndarray
+        self, z: np.ndarray, dual: np.ndarray, target: np.ndarray, ball: np.ndarray, w: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The nearest x within the ball to each z, or z where its residual will do; and the gaps.
 
         For any dual variable with :math:`|A^H \\lambda|_j \\le w_j` the norm is at least
         :math:`\\mathrm{Re}\\,\\lambda^H b - \\delta \\|\\lambda\\|`.
         """
-        s, w = self.singular, self.weight
+        s = self.singular
         left = s * (self.right @ z) - target
         size = np.linalg.norm(left, axis=0)
         excess = np.maximum(1 - ball / np.maximum(size, 1e-300), 0)

@@ -136,6 +136,18 @@ def test_weights_and_a_start():
     np.testing.assert_allclose((weights[:, None] * np.abs(warm.x)).sum(0), norms[0], rtol=2e-3)
 
 
+def test_every_right_hand_side_may_have_its_own_weights():
+    a, b, delta, _ = problem(6)
+    weights = np.random.default_rng(1).uniform(0.2, 2, (80, b.shape[1]))
+    found = basis_pursuit_denoise(a, b, delta, weights=weights, tolerance=1e-6, iterations=20_000)
+    balls = np.broadcast_to(delta, b.shape[1])
+    for k, ball in enumerate(balls):
+        alone = basis_pursuit_denoise(a, b[:, [k]], ball, weights=weights[:, k], tolerance=1e-6, iterations=20_000)
+        np.testing.assert_allclose(found.x[:, k], alone.x[:, 0], atol=1e-3 * np.abs(alone.x).max())
+    with pytest.raises(ValueError, match="weights must have shape"):
+        basis_pursuit_denoise(a, b, delta, weights=weights[:, :-1])
+
+
 def test_single_precision_stays_single_and_within_the_residual():
     a, b, delta, _ = problem(7)
     found = basis_pursuit_denoise(a.astype(np.complex64), b.astype(np.complex64), delta)
