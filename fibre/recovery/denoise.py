@@ -65,8 +65,9 @@ def basis_pursuit_denoise(
 
     Parameters
     ----------
-    matrix: complex or real (m, n). rhs: (m, k). delta: (k,) or one number, >= 0, in the unit of rhs. weights: > 0, (n,) or,
-    of every right-hand side its own, (n, k); None: 1. start: (n, k) to begin with, or None. tolerance: relative gap, > 0. iterations: most, >= 1.
+    matrix: complex or real (m, n). rhs: (m, k). delta: (k,) or one number, >= 0, in the unit of rhs. weights: > 0, of
+    all right-hand sides (n,) or of each its own (n, k); None: 1. start: (n, k) to begin with, or None. tolerance:
+    relative gap, > 0. iterations: most, >= 1.
 
     Raises
     ------
