@@ -109,14 +109,16 @@ def plot_pixel(draws: Draws, pixel: tuple[int, ...]) -> Figure:
         raise ValueError(f"pixel {pixel} has no draws: it is masked or not finite; choose another one.")
     columns = _columns(draws, place)
     count = len(columns)
-    figure = Figure(figsize=(1.9 * count + 0.6, 1.9 * count + 0.6), layout="constrained")
-    grid = figure.subplots(count, count, squeeze=False, sharex="col")
-    for i, down in enumerate(columns):
-        for j, across in enumerate(columns):
-            axes = grid[i, j]
-            if j > i:
-                axes.remove()
-                continue
+    side = 1.9 * count + 0.6
+    figure = Figure(figsize=(side, side))
+    # fixed margins: to measure all labels takes longer than to draw them
+    left, top = 0.75 / side, 1 - 0.3 / side
+    grid = figure.add_gridspec(count, count, left=left, right=1 - 0.1 / side, bottom=0.65 / side, top=top, wspace=0.12)
+    lowest: dict[int, Any] = {}
+    for i, down in reversed(list(enumerate(columns))):
+        for j, across in enumerate(columns[: i + 1]):
+            axes = figure.add_subplot(grid[i, j], sharex=lowest.get(j))
+            lowest.setdefault(j, axes)
             if i == j:
                 axes.hist(down.values, bins=40, color="0.6")
                 axes.axvline(down.mean, color="C3", linewidth=1)
@@ -132,7 +134,7 @@ def plot_pixel(draws: Draws, pixel: tuple[int, ...]) -> Figure:
                 axes.tick_params(labelleft=j == 0)
             axes.xaxis.set_major_locator(MaxNLocator(4))
             axes.xaxis.set_major_formatter(FuncFormatter(across.name_tick))
-            axes.tick_params(labelsize=7)
+            axes.tick_params(labelsize=7, labelbottom=i == count - 1)
             if i == count - 1:
                 axes.set_xlabel(across.label, fontsize=9)
             if j == 0 and i > 0:

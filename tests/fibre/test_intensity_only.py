@@ -39,7 +39,10 @@ def banded(m, n, width, seed=0):
     return rows * (np.abs(np.arange(m)[:, None] * n / m - np.arange(n)) <= width)
 
 
-@pytest.mark.parametrize("algorithm", ["variational", "message_passing"])
+@pytest.mark.parametrize(
+    "algorithm",
+    ["variational", pytest.param("message_passing", marks=pytest.mark.slow)],  # sparse rows below
+)
 def test_gaussian_rows_are_found_from_eight_intensities_an_unknown(algorithm):
     rows = complex_noise(np.random.default_rng(0), (64, 64))
     found = rows_from_intensities(*measured(rows, 512, 1), algorithm=algorithm)
