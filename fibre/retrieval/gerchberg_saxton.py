@@ -91,10 +91,11 @@ class GerchbergSaxton(RetrievalMethod):
         # code is compiled for a shape: pieces are filled up, so that few shapes occur
         filled = np.resize(chosen, -(-len(chosen) // size) * size)
         found: list[_Found] = [None] * (len(filled) // size)  # type: ignore[list-item]
+        amplitudes, weights = stack.amplitudes, stack.weights
 
         def part(k: int) -> None:
             some = filled[k * size : (k + 1) * size]
-            images = (stack.amplitudes[some], stack.weights[some], stack.masks)
+            images = (amplitudes[some], weights[some], stack.masks)
             spectrum, change, sweeps = _spectra(images, phase, tolerance[some], self.iterations, self.averaging, coarse)
             field = np.array(jnp.fft.ifft2(spectrum))
             found[k] = _Found(field, np.array(change), np.array(sweeps) + self.averaging, misfit(field, *images))

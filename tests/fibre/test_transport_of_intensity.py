@@ -245,8 +245,8 @@ def test_a_lamp_that_drifts_is_no_lens():
 
 
 def test_a_dark_image_gives_a_dark_field_and_no_nan():
-    for variance in (None, np.ones((5, 16, 16)), np.full((5, 16, 16), np.inf)):
-        found = retrieve(Defocus(np.zeros((5, 16, 16)), PLANES, WAVELENGTH, PIXEL, variance), TransportOfIntensity())
+    for variance in (None, np.ones((5, N, N)), np.full((5, N, N), np.inf)):
+        found = retrieve(Defocus(np.zeros((5, N, N)), PLANES, WAVELENGTH, PIXEL, variance), TransportOfIntensity())
         assert np.all(found.field == 0)
         assert np.all(np.isfinite(found.variance))
 
