@@ -129,13 +129,13 @@ def run_demo(
     folder: str | Path,
     seed: int = 0,
     progress: bool = False,
-    grid: tuple[int, int] = GRID,
     page: bool = False,
     setup: Setup | None = None,
 ) -> DemoResult:
-    """Simulate, capture, retrieve, recover, reconstruct and fit a sample of ``grid`` points; every record is saved in
-    ``folder``. ``page``: write a report too, with posteriors, the comparison of the orderings, and texture. ``setup``:
-    another scene with its plans, None: :func:`demo_setup`.
+    """Simulate, capture, retrieve, recover, reconstruct and fit a sample; every record is saved in ``folder``.
+
+    ``page``: write a report too, with posteriors, the comparison of the orderings, and texture. ``setup``: another
+    scene with its plans, None: :func:`demo_setup`.
 
     Captures already complete in ``folder`` are not taken again; everything later is made anew and overwritten.
     """
@@ -154,7 +154,7 @@ def run_demo(
         files.append(fibre.save(record, folder / name, overwrite=True))
 
     with stage("simulated bench"):
-        setup = setup or demo_setup(seed, grid)
+        setup = setup or demo_setup(seed)
         scene = setup.scene
         bench = SimulatedBench(scene, rng=seed)
     keep(scene.phantom, "phantom.nc")
