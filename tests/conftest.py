@@ -1,4 +1,4 @@
-"""Settings of every test process."""
+"""Settings of every test process, and the bench that all of a run share."""
 
 from __future__ import annotations
 

@@ -66,8 +66,8 @@ class GerchbergSaxton(RetrievalMethod):
         # the planes' noise keeps the field moving by a few per cent of it, however long one waits
         tolerance = np.asarray(np.maximum(self.tolerance, 0.1 * noise) * (self.tolerance > 0), np.float32)
         coarse = self.coarsening if all(n % (2 * self.coarsening) == 0 for n in shape) else 1
-        found = self._run(stack, np.arange(len(noise)), tolerance, np.zeros(shape, np.float32), coarse)
-        field, change, spent, left = found
+        everything, flat = np.arange(len(noise)), np.zeros(shape, np.float32)
+        field, change, spent, left = self._run(stack, everything, tolerance, flat, coarse)
         # planes that contradict each other keep a field moving for ever: it is found where noise explains what is left
         explained = np.zeros(len(noise)) if stack.measured.expected is None else 2 * np.asarray(stack.measured.expected)
         for restart in range(self.restarts):

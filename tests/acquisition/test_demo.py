@@ -15,18 +15,22 @@ from polinfer import Parameters
 from polinfer.cli import main
 
 GRID = (10, 10)
-# the demo's own bench, with spots that are lit together three points apart instead of four: 30 captures instead of 51
-SETUP = replace(demo_setup(0, GRID), calibration=CalibrationPlan(GRID, stride=3, reference_every=24))
+
+
+@pytest.fixture(scope="module", params=[3, pytest.param(4, marks=pytest.mark.slow)])
+def setup(request):
+    """The demo's bench, spots that are lit together so many points apart: its own 4 make 51 captures, 3 make 30."""
+    return replace(demo_setup(0, GRID), calibration=CalibrationPlan(GRID, stride=request.param, reference_every=24))
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(setup, tmp_path_factory):
     return tmp_path_factory.mktemp("demo")
 
 
 @pytest.fixture(scope="module")
-def result(folder):
-    return run_demo(folder, 0, setup=SETUP)
+def result(setup, folder):
+    return run_demo(folder, 0, setup=setup)
 
 
 def test_the_fitted_jones_matrices_are_true_within_the_noise(result):
@@ -47,9 +51,9 @@ def test_every_file_is_there_and_loads(result, folder):
     np.testing.assert_array_equal(fibre.load(folder / "fit.nc").parameters.retardance, result.fit.parameters.retardance)
 
 
-def test_a_second_run_takes_no_new_capture(result, folder, monkeypatch):
+def test_a_second_run_takes_no_new_capture(setup, result, folder, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*/*.npz")}
-    assert len(before) >= len(SETUP.calibration.captures) + len(SETUP.sample.captures)
+    assert len(before) >= len(setup.calibration.captures) + len(setup.sample.captures)
 
     class Enough(Exception):
         pass
@@ -60,7 +64,7 @@ def test_a_second_run_takes_no_new_capture(result, folder, monkeypatch):
     monkeypatch.setattr(Folder, "store", lambda *arguments: pytest.fail("a capture was taken again"))
     monkeypatch.setattr(fibre, "retrieve_fields", stop)  # both captures are done when the first fields are asked for
     with pytest.raises(Enough):
-        run_demo(folder, 0, setup=SETUP)
+        run_demo(folder, 0, setup=setup)
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*/*.npz")} == before
 
 
