@@ -112,8 +112,8 @@ def plot_pixel(draws: Draws, pixel: tuple[int, ...]) -> Figure:
     side = 1.9 * count + 0.6
     figure = Figure(figsize=(side, side))
     # fixed margins: to measure all labels takes longer than to draw them
-    left, top = 0.75 / side, 1 - 0.3 / side
-    grid = figure.add_gridspec(count, count, left=left, right=1 - 0.1 / side, bottom=0.65 / side, top=top, wspace=0.12)
+    left, top = 0.85 / side, 1 - 0.3 / side
+    grid = figure.add_gridspec(count, count, left=left, right=1 - 0.2 / side, bottom=0.65 / side, top=top, wspace=0.12)
     lowest: dict[int, Any] = {}
     for i, down in reversed(list(enumerate(columns))):
         for j, across in enumerate(columns[: i + 1]):

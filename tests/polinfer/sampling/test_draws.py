@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import polinfer
 from polinfer import ComplexGain, InferredNoise, Measurement, Model, Parameters, PhaseGain, Status, Window
@@ -291,6 +292,18 @@ def test_the_joint_posterior_shows_gain_and_sigma_and_no_fixed_parameter():
     model = Model(gain=PhaseGain(), fixed={"retardance_angle": 0.0})
     draws = draws_of(model, gain=np.exp(0.1j * np.random.default_rng(1).normal(size=(4, 250))))
     assert len(plot_pixel(draws, ()).axes) == 4 * 5 // 2  # three parameters and the phase
+
+
+@pytest.mark.parametrize("spread", [0.1, 1e-5])
+def test_no_label_of_the_joint_posterior_is_cut_by_the_margin(spread):
+    """The margins are fixed: with narrow clouds the ticks have many digits."""
+    generator = np.random.default_rng(2)
+    values = Parameters(*generator.normal(0.5, spread, (5, 4, 250)))
+    gain, sigma = 1e3 * (1j + generator.normal(0.5, spread, (4, 250))), generator.normal(1e-5, 5e-7, (4, 250))
+    figure = plot_pixel(draws_of(Model(gain=ComplexGain(1e3)), parameters=values, gain=gain, sigma=sigma), ())
+    box = figure.get_tightbbox(FigureCanvasAgg(figure).get_renderer())  # inches
+    assert min(box.x0, box.y0) >= 0
+    assert max(box.x1, box.y1) <= figure.get_figwidth() == figure.get_figheight()
 
 
 @pytest.mark.parametrize(
