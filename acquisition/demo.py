@@ -27,6 +27,7 @@ from fibre.calibration import clean_fibrelets
 from fibre.retrieval.base import RetrievalMethod
 from polinfer import ComplexGain, Fit, Measurement, Model, Parameters, RetarderFirst, phantoms
 from polinfer.degeneracy import nearest
+from polinfer.orderings.on_host import jones_on_host
 from polinfer.validation import jones_chi_square
 
 __all__ = ["DemoResult", "Setup", "demo_scene", "demo_setup", "full_setup", "report", "run_demo", "stages"]
@@ -63,7 +64,7 @@ class DemoResult:
     def jones(self) -> np.ndarray:
         """The true Jones matrices with the sample's amplitude and phase, complex (y, x, 2, 2)."""
         gain = np.asarray(self.phantom.gain)[..., None, None]
-        return np.asarray(RetarderFirst().jones(self.phantom.parameters)) * gain
+        return jones_on_host(RetarderFirst(), self.phantom.parameters) * gain
 
     @property
     def chi_square(self) -> tuple[float, int, int]:

@@ -11,6 +11,7 @@ from .checks import complex_array, one_of_types, real_array
 from .degeneracy import canonicalise
 from .neighbours import Window, box_mean
 from .orderings import Ordering, PolariserFirst, RetarderFirst
+from .orderings.on_host import jones_on_host
 from .records import Parameters
 from .threads import each
 
@@ -121,8 +122,8 @@ def ordering_error(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
     """
     one_of_types("parameters", parameters, (Parameters,), "pass Parameters(...).")
     values = Parameters(*(real_array(n, x) for n, x in zip(Parameters._fields, parameters, strict=True)))
-    forward = np.asarray(RetarderFirst().jones(values))
-    difference = np.abs(forward - np.asarray(PolariserFirst().jones(values)))
+    forward = jones_on_host(RetarderFirst(), values)
+    difference = np.abs(forward - jones_on_host(PolariserFirst(), values))
     with np.errstate(divide="ignore", invalid="ignore"):
         q = np.mean(np.where(difference == 0, 0, difference / np.abs(forward)), axis=(-1, -2))
     size = np.sqrt(np.sum(difference**2, axis=(-1, -2)) / np.sum(np.abs(forward) ** 2, axis=(-1, -2)))

@@ -327,5 +327,5 @@ def as_device(statistics: Any, dtype: Any) -> Any:
     complex_type = jax.dtypes.canonicalize_dtype(dtype)
     real_type = np.zeros((), complex_type).real.dtype
     return jax.tree.map(
-        lambda x: jnp.asarray(np.asarray(x).astype(complex_type if np.iscomplexobj(x) else real_type)), statistics
+        lambda x: jax.device_put(np.asarray(x).astype(complex_type if np.iscomplexobj(x) else real_type)), statistics
     )

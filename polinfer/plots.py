@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     from .phantoms import Phantom
     from .sampling.summaries import Summary
 
-__all__ = ["colour_circle", "draw_map", "explain", "plot_fit", "plot_phantom", "plot_summary", "two_rows"]
+__all__ = ["colour_circle", "draw_map", "explain", "map_grid", "plot_fit", "plot_phantom", "plot_summary"]
 
 TITLES = Parameters(
     "diattenuation", "diattenuation angle (°)", "retardance (°)", "retardance angle (°)", "circularity (°)"
 )
 _NO_ANSWER = int(Status.MASKED | Status.NON_FINITE | Status.NOT_CONVERGED)
 _GREY = "0.8"
+# inches: width of a map, of its colour bar and the gap before it, of all that is beside a map, before the first map,
+# height of a title, of a scale bar, of the line that explains what grey and hatched pixels are
+MAP, BAR, BAR_GAP, BESIDE, LEFT, TITLE, SCALE_BAR, EXPLANATION = 2.1, 0.1, 0.06, 0.75, 0.1, 0.32, 0.2, 0.36
 _HATCHED: dict[str, Any] = {"facecolor": "0.93", "edgecolor": "0.45", "hatch": "//////"}
 
 
@@ -125,21 +128,41 @@ def draw_map(
     axes.set_xticks([])
     axes.set_yticks([])
     ticks = None if period is None else np.linspace(-0.5, 0.5, 5) * period
-    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03, extend=extend, ticks=ticks)
+    # as high as the map is shown, and as wide as all others
+    box, inches = axes.get_position(), axes.figure.get_size_inches()
+    wide = (
+        box.width * inches[0]
+        if long
+        else min(box.width * inches[0], box.height * inches[1] * image.shape[1] / image.shape[0])
+    )
+    beside = axes.inset_axes((1 + BAR_GAP / wide, 0, BAR / wide, 1))
+    bar = axes.figure.colorbar(drawn, cax=beside, extend=extend, ticks=ticks)
     bar.ax.tick_params(labelsize=7)
     if pixel_size is not None and not (long and image.shape[0] > image.shape[1]):
         _scale_bar(axes, image.shape[1], pixel_size)
 
 
-def two_rows(pixels: np.ndarray, columns: int, pixel_size: float | None) -> tuple[Figure, np.ndarray]:
-    """A figure with two rows of maps, as high as ``pixels``, one of the maps, ask for."""
+def map_grid(
+    pixels: np.ndarray, rows: int, columns: int, pixel_size: float | None, below: float = EXPLANATION,
+    right: float = BESIDE,
+) -> tuple[Figure, np.ndarray]:  # fmt: skip
+    """A figure with rows of maps, as high as ``pixels``, one of the maps, ask for.
+
+    Margins are fixed, with room for titles, colour bars and scale bars: to measure the text of fifteen maps takes
+    longer than to draw them. ``below`` the maps there is room for :func:`explain`, and to the ``right`` of the last one
+    for what stands there, in inches.
+    """
     from matplotlib.figure import Figure
 
     high, wide = _image(pixels).shape
-    height = min(max(2.2 * high / wide, 0.7), 3.0)
-    figure = Figure(figsize=(2.9 * columns, 2 * (height + (0.5 if pixel_size is None else 0.7)) + 0.2),
-                    layout="constrained")  # fmt: skip
-    return figure, figure.subplots(2, columns, squeeze=False)
+    height = min(max(MAP * high / wide, 0.7), 3.0)
+    gap = TITLE if pixel_size is None else TITLE + SCALE_BAR
+    size = (LEFT + (MAP + BESIDE) * columns - BESIDE + right, (height + gap) * rows + below)
+    edges = {"left": LEFT / size[0], "right": 1 - right / size[0], "top": 1 - TITLE / size[1],
+             "bottom": (below + gap - TITLE) / size[1]}  # fmt: skip
+    figure = Figure(figsize=size)
+    gaps = {"wspace": BESIDE / MAP, "hspace": gap / height}
+    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=edges | gaps)
 
 
 def _draw_parameters(
@@ -180,7 +203,7 @@ def explain(figure: Figure, grey: bool, hatched: bool, smooth: bool) -> None:
     handles += [Patch(**_HATCHED, linewidth=0, label="no answer")] if hatched else []
     handles += [Patch(alpha=0, label="smooth gauge")] if smooth else []
     if handles:
-        figure.legend(handles=handles, loc="outside lower right", ncols=3, fontsize=8, frameon=False, borderpad=0)
+        figure.legend(handles=handles, loc="lower right", ncols=3, fontsize=8, frameon=False, borderpad=0.5)
 
 
 def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) -> Figure:
@@ -216,7 +239,7 @@ def plot_fit(fit: Fit, smooth: bool = False, pixel_size: float | None = None) ->
     status = np.asarray(fit.status)
     lost = (status & _NO_ANSWER) != 0
     extra = (1 if fit.gain is None else 2) + (fit.tilt is not None)
-    figure, axes = two_rows(status, 5 + extra, pixel_size)
+    figure, axes = map_grid(status, 2, 5 + extra, pixel_size)
     quality = axes[1] if fit.gain is not None else axes[:, 0]
     if fit.gain is not None:
         draw_map(axes[0, 0], "amplitude", np.abs(fit.gain), lost, pixel_size=pixel_size)
@@ -262,7 +285,7 @@ def plot_summary(summary: Summary, smooth: bool = False, pixel_size: float | Non
         pixel_size = real_number("pixel_size", pixel_size, above=0)
     status = np.asarray(summary.status)
     lost = (status & _NO_ANSWER) != 0
-    figure, axes = two_rows(status, 6, pixel_size)
+    figure, axes = map_grid(status, 2, 6, pixel_size)
     # how the chains fare is shown where it is bad, too
     none = np.isnan(summary.ess)
     # infinite where no chain has moved
@@ -294,8 +317,6 @@ def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
     >>> [axes.get_title() for axes in figure.axes][:3]
     ['amplitude', 'phase (°)', 'diattenuation']
     """
-    from matplotlib.figure import Figure
-
     from .phantoms import Phantom
 
     one_of_types("phantom", phantom, (Phantom,), "pass one of polinfer.phantoms.")
@@ -306,10 +327,10 @@ def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
     frames = [phantom] if phantom.labels.ndim == 2 else [phantom[i] for i in range(len(phantom))]
     several = int(phantom.labels.max(initial=0)) > 0
     columns = 7 + (phantom.tilt is not None) + several
-    high, wide = frames[0].labels.shape
-    height = min(max(2.2 * high / wide, 0.7), 3.0) + (0.3 if pixel_size is None else 0.5)
-    figure = Figure(figsize=(2.9 * columns, height * len(frames) + 0.2), layout="constrained")
-    for row, frame in zip(figure.subplots(len(frames), columns, squeeze=False), frames, strict=True):
+    labels = frames[0].labels
+    right = max(BESIDE, 0.5 + 0.08 * max(map(len, phantom.names), default=0)) if several else BESIDE
+    figure, grid = map_grid(labels, len(frames), columns, pixel_size, 0.1, right)
+    for row, frame in zip(grid, frames, strict=True):
         maps: list[tuple[str, Any, float | None]] = [
             ("amplitude", np.abs(frame.gain), None),
             ("phase (°)", np.degrees(np.angle(frame.gain)), 360.0),
@@ -320,7 +341,7 @@ def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
         if frame.tilt is not None:
             maps.append(("tilt (°)", np.degrees(np.angle(np.exp(1j * frame.tilt))), 360.0))
         for axes, (title, value, period) in zip(row, maps, strict=False):
-            draw_map(axes, title, value, np.zeros((high, wide), bool), period, pixel_size=pixel_size)
+            draw_map(axes, title, value, np.zeros(labels.shape, bool), period, pixel_size=pixel_size)
         if several:
             _draw_regions(row[-1], frame.labels, int(phantom.labels.max()), phantom.names, pixel_size)
     return figure

@@ -8,6 +8,7 @@ import numpy as np
 
 from .checks import as_generator, broadcast, complex_array, one_of_types, real_array
 from .model import Model
+from .orderings.on_host import jones_on_host
 from .records import Measurement, Parameters
 from .tilting import tilted
 
@@ -58,7 +59,9 @@ def simulate(
     )
     generator, seed = as_generator(rng)
     factor = model.known_gain.sample(generator, shape) if given is None else given
-    jones = np.asarray(model.jones(Parameters(**dict.fromkeys(Parameters._fields, 0.0) | values)))
+    jones = jones_on_host(
+        model.ordering, Parameters(**dict.fromkeys(Parameters._fields, 0.0) | values | dict(model.fixed))
+    )
     if phase is not None:
         jones = tilted(jones, phase)
     clean = factor[..., None, None] * (jones @ illumination)

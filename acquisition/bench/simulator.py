@@ -17,6 +17,7 @@ from acquisition.exposure import InverseVariance, MergeRule
 from acquisition.plan import Step, Views
 from polinfer import RetarderFirst
 from polinfer.checks import as_generator, one_of_types
+from polinfer.orderings.on_host import jones_on_host
 
 __all__ = ["SimulatedBench"]
 
@@ -151,7 +152,7 @@ class SimulatedBench:
         """Jones matrices on the grid, and places, light, Jones matrices and spot size of the finer sample."""
         scene = self.scene
         parameters, gain = scene.phantom.parameters, scene.phantom.gain
-        jones = np.asarray(RetarderFirst().jones(parameters))
+        jones = jones_on_host(RetarderFirst(), parameters)
         if gain is not None:
             jones = jones * np.asarray(gain)[..., None, None]
         rows, columns = jones.shape[:2]

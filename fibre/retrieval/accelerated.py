@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,10 +84,10 @@ class Accelerated(RetrievalMethod):
         return Solution(np.asarray(field), done, start.iterations + int(count))
 
 
-@partial(jax.jit, static_argnums=(7, 8))
+@partial(jax.jit, static_argnums=8)
 def _run(
     start: jax.Array, amplitudes: jax.Array, weights: jax.Array, masks: jax.Array, spread: jax.Array,
-    tolerance: jax.Array, noise: jax.Array, iterations: int, with_gains: bool,
+    tolerance: jax.Array, noise: jax.Array, iterations: Any, with_gains: bool,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
     """Fields (b, y, x), their last relative change (b,), iterations."""
     unseen = 1 - jnp.abs(masks) ** 2

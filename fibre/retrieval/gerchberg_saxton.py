@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -149,14 +149,14 @@ def _project(view: jax.Array, amplitude: jax.Array, weight: jax.Array) -> jax.Ar
     return view * (1 + weight * (amplitude / jnp.maximum(modulus, 1e-20) - 1))
 
 
-@partial(jax.jit, static_argnums=(5, 6))
+@partial(jax.jit, static_argnums=6)
 def _solve(
     amplitudes: jax.Array,
     weights: jax.Array,
     masks: jax.Array,
     first: jax.Array,
     tolerance: jax.Array,
-    iterations: int,
+    iterations: Any,
     averaging: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Spectra from the spectra ``first``, the last relative change, and the number of sweeps; every field stops for

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -104,7 +105,7 @@ class TransportOfIntensity(RetrievalMethod):
             intensity, slope, *spreads = _fit(stack.intensities, weights, powers.astype(np.float32))
         field, left, count = _solve(
             intensity, slope, np.float32(scale), pull, np.float32(self.darkest),
-            np.float32(self.tolerance), self.iterations, self.mirrored,
+            np.float32(self.tolerance), self.iterations, self.iterations > 0, self.mirrored,
         )  # fmt: skip
         variance = None
         if spreads:
@@ -189,7 +190,7 @@ def _variance(
     return np.where(spread > 0, variance, uniform.reshape(batch, 1, 1)).astype(np.float32)
 
 
-@partial(jax.jit, static_argnums=(6, 7))
+@partial(jax.jit, static_argnums=(7, 8))
 def _solve(
     intensity: jax.Array,
     slope: jax.Array,
@@ -197,7 +198,8 @@ def _solve(
     pull: jax.Array,
     darkest: jax.Array,
     tolerance: jax.Array,
-    iterations: int,
+    iterations: Any,
+    refined: bool,
     mirrored: bool,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Fields (b, y, x), the part of the derivative that is left (b), steps (b)."""
@@ -212,7 +214,7 @@ def _solve(
     def as_if_uniform(left: jax.Array) -> jax.Array:
         return _inverse(left / uniform, laplacian, mirrored)
 
-    if iterations == 0:
+    if not refined:
         phase = as_if_uniform(source)
         count = jnp.zeros(len(intensity), jnp.int32)
         rest = jnp.zeros(len(intensity), intensity.dtype)
@@ -235,7 +237,7 @@ def _refine(
     as_if_uniform: Callable[[jax.Array], jax.Array],
     carried: Callable[[jax.Array], jax.Array],
     tolerance: jax.Array,
-    iterations: int,
+    iterations: Any,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Phase whose ``carried`` is the source (b, y, x), the part left (b), steps (b), by conjugate gradients.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..checks import real_number
-from ..plots import draw_map, explain, two_rows
+from ..plots import draw_map, explain, map_grid
 from .angles import Angle
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def plot_texture(textures: dict[str, Texture], pixel_size: float | None = None) 
         raise ValueError("textures is empty; pass at least one.")
     if pixel_size is not None:
         pixel_size = real_number("pixel_size", pixel_size, above=0)
-    figure, axes = two_rows(next(iter(textures.values())).entropy, len(textures), pixel_size)
+    figure, axes = map_grid(next(iter(textures.values())).entropy, 2, len(textures), pixel_size)
     hatched = False
     for (name, texture), (above, below) in zip(textures.items(), axes.T, strict=True):
         words = name.replace("_", " ")

@@ -164,6 +164,20 @@ def test_every_map_has_the_same_scale_bar_of_a_round_length(result, pixel_size, 
         assert bar.txt_label.get_text() == label
 
 
+def test_numbers_beside_a_map_reach_neither_the_next_one_nor_the_end_of_the_figure(result):
+    wide = replace(result, log_evidence=30 * result.log_evidence - 123456.7, chi_square=1e6 * result.chi_square)
+    figure = plot_fit(wide)
+    figure.draw_without_rendering()
+    titled = [axes for axes in figure.axes if axes.get_title()]
+    ends = [axes.images[0].colorbar.ax.get_tightbbox().x1 for axes in titled]
+    for axes, end in zip(titled, ends, strict=True):
+        assert end > axes.bbox.x1
+        assert end < min([other.bbox.x0 for other in titled if other.bbox.x0 > axes.bbox.x1], default=figure.bbox.x1)
+    legend = figure.legends[0].get_tightbbox()
+    assert legend.y0 >= 0
+    assert legend.y1 <= min(axes.bbox.y0 for axes in titled)
+
+
 def test_a_parameter_that_drops_out_of_the_matrix_is_grey_with_its_uncertainty(result):
     nothing, flag = np.full((6, 8), np.nan), int(Status.UNIDENTIFIED_DIATTENUATION_ANGLE)
     dropped = replace(
