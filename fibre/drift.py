@@ -210,11 +210,11 @@ def _scaled(drift: Drift) -> _Walk:
 
 
 def _updated(
-    mean: np.ndarray, spread: np.ndarray, measured: np.ndarray, noise: np.ndarray
+    mean: np.ndarray, spread: np.ndarray, measured: np.ndarray, noise: np.ndarray, inverse: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Kalman's update of a state (3,) and its covariance by a measurement of all of it; in Joseph's form, in which the
-    covariance stays one."""
-    gain = spread @ np.linalg.pinv(spread + noise, hermitian=True)
+    covariance stays one. ``inverse`` is that of ``spread + noise``."""
+    gain = spread @ inverse
     rest = np.eye(3) - gain
     return mean + gain @ (measured - mean), rest @ spread @ rest.T + gain @ noise @ gain.T
 
@@ -230,7 +230,8 @@ def _smooth(walk: _Walk, wanted: np.ndarray) -> States:
         spread = spread + np.diag(walk.rates * step)
         predicted.append((mean, spread))
         if (k := measured.get(float(time))) is not None:
-            mean, spread = _updated(mean, spread, walk.mean[k], walk.covariance[k])
+            inverse = np.linalg.pinv(spread + walk.covariance[k], hermitian=True)
+            mean, spread = _updated(mean, spread, walk.mean[k], walk.covariance[k], inverse)
         filtered.append((mean, spread))
     result = [filtered[-1]]
     for k in range(len(times) - 2, -1, -1):
@@ -262,8 +263,9 @@ def _rates(times: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.nd
             spread = spread + np.diag(rates * (times[k] - times[k - 1]))
             whole = spread + covariance[k]
             left = mean[k] - state
-            total += float(left @ np.linalg.solve(whole, left) + np.linalg.slogdet(whole)[1])
-            state, spread = _updated(state, spread, mean[k], covariance[k])
+            inverse = np.linalg.inv(whole)
+            total += float(left @ inverse @ left + np.linalg.slogdet(whole)[1])
+            state, spread = _updated(state, spread, mean[k], covariance[k], inverse)
         return total
 
     steps = np.diff(mean, axis=0) ** 2 / np.diff(times)[:, None]

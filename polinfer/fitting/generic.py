@@ -17,7 +17,7 @@ from ..statistics import Statistics, Summary, summarise
 from .charts import from_parameters, to_parameters
 from .edges import integrate
 from .frame_noise import effective_parameters, misfit
-from .local_gaussian import Local, describe, equivalent, log_density, uniform_std
+from .local_gaussian import Local, describe, equivalent, log_density, log_prior, uniform_std
 from .newton import maximise
 from .residuals import judge
 from .start import starts
@@ -47,7 +47,7 @@ def _strength(statistics: Statistics | Windowed) -> np.ndarray:
 def _canonical(model: Model, parameters: Parameters, statistics: Statistics | Windowed) -> Parameters:
     """Of the equivalent copies with the highest density, the one nearest to the reference."""
     copies = equivalent(model, parameters)
-    prior = np.asarray(model.log_prior(copies))
+    prior = np.asarray(log_prior(model, copies))
     likelihood = np.asarray(log_density(model, copies, statistics)) - np.where(np.isfinite(prior), prior, 0)
     likelihood = np.where(np.isnan(likelihood), -np.inf, likelihood)
     # Likelihoods of copies differ by rounding only, eps times the signal-to-noise ratio, unless an ordering of the

@@ -25,6 +25,7 @@ __all__ = [
     "equivalent",
     "invert",
     "log_density",
+    "log_prior",
     "log_prior_ratio",
 ]
 
@@ -107,11 +108,17 @@ def invert(curvature: np.ndarray, eps: float, least: float) -> tuple[np.ndarray,
     return covariance, log_volume, flat
 
 
+@partial(jax.jit, static_argnums=0)
+def log_prior(model: Model, parameters: Parameters) -> jax.Array:
+    """Log prior density, compiled as a whole: of its twenty operations each would be compiled for itself."""
+    return model.log_prior(parameters)
+
+
 def log_prior_ratio(model: Model, parameters: Parameters) -> np.ndarray:
     """``log sum_c p(copy c) / p(parameters)`` over the equivalent copies: what their evidence adds to that of one."""
-    priors = np.asarray(model.log_prior(equivalent(model, parameters)), float)
+    priors = np.asarray(log_prior(model, equivalent(model, parameters)), float)
     with np.errstate(invalid="ignore"):
-        return np.nan_to_num(np.logaddexp.reduce(priors, axis=0) - np.asarray(model.log_prior(parameters), float))
+        return np.nan_to_num(np.logaddexp.reduce(priors, axis=0) - np.asarray(log_prior(model, parameters), float))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -1,9 +1,12 @@
 """A frame by the fast route: each pixel is fitted alone, whatever the frame holds and however it is cut."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from polinfer import (
+    ComplexGain,
     Measurement,
     Parameters,
     Status,
@@ -11,6 +14,7 @@ from polinfer import (
     simulate,
 )
 from polinfer.fitting import frames
+from polinfer.fitting.fast import kernel
 from tests.polinfer.scenes import (
     BALANCED,
     FREE,
@@ -72,6 +76,17 @@ def test_more_pixels_than_a_block_are_fitted_as_block_by_block():
         part = slice(begin, begin + 900)
         # a few pixels at a time and many are compiled code of their own, which may round otherwise
         assert_equal(fit(FREE, Measurement(BALANCED, data.response[part], 0.2)), whole, np.s_[...], part, 1e-6)
+
+
+def test_a_gain_in_another_unit_is_fitted_by_the_same_code():
+    (model, data), one = case("skew states"), fitted("skew states")
+    compiled = kernel.from_statistics._cache_size()
+    scaled = replace(data, response=2e-4 * data.response, sigma=2e-4 * data.sigma)
+    other = fit(replace(model, gain=ComplexGain(2e-4 * model.gain.scale)), scaled)
+    assert kernel.from_statistics._cache_size() == compiled
+    for name in Parameters._fields:
+        np.testing.assert_allclose(getattr(other.parameters, name), getattr(one.parameters, name), atol=1e-6)
+    np.testing.assert_allclose(other.gain, 2e-4 * one.gain, atol=1e-9)
 
 
 def test_masked_and_nan_pixels_are_nan_and_leave_the_others_alone():

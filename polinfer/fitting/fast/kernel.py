@@ -54,7 +54,7 @@ def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, it
     return describe(scene, data, *climb(scene, balanced, data, begun, iterations, given != STAY, patience))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=1)
 def from_statistics(
     scene: Scene, balanced: bool, statistics: Statistics, start: Any, given: Any, iterations: Any, one: Any
 ) -> tuple[Any, Any]:
@@ -73,7 +73,7 @@ def from_statistics(
     return _finish(scene, balanced, data, start, given, iterations)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=1)
 def from_responses(
     scene: Scene,
     balanced: bool,

@@ -1,14 +1,17 @@
 """The log likelihood as a function of the overlap and the energy, for each kind of gain and noise.
 
 Each class gives, element-wise, the value formed from residuals (no large numbers cancel), and the derivatives by
-``r``, the overlap turned to the phase of the gain, by the energy ``m``, and across the phase.
+``r``, the overlap turned to the phase of the gain, by the energy ``m``, and across the phase. Compiled code takes their
+numbers as arguments: one that holds for a gain of any size.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from ...circular import bessel_ratio, log_scaled_bessel
@@ -65,6 +68,7 @@ def square(model: list[list[Pair]], data: list[list[Pair]], gain: Pair | None) -
     return total
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=[])
 @dataclass(frozen=True)
 class Unit:
     """g = 1 and sigma known: ``-|M - Y|^2``."""
@@ -88,6 +92,7 @@ class Unit:
         return None
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=[])
 @dataclass(frozen=True)
 class Phase:
     """``|g| = 1``, phase uniform: ``log I_0(2 |a|) - m - |Y|^2``."""
@@ -126,11 +131,12 @@ class Phase:
         return at.gain[0] * ratio, at.gain[1] * ratio
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["precision"], meta_fields=[])
 @dataclass(frozen=True)
 class Complex:
     """``g ~ CN(0, t^2)``: ``|a|^2 / (m + 1/t^2) - log(1 + t^2 m) - |Y|^2``; ``precision`` is 1/t^2."""
 
-    precision: float
+    precision: Any
     free_phase = True
 
     def residual(self, model: list[list[Pair]], data: list[list[Pair]]) -> Residual:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import asin, cos, pi, sin
+
+import jax
 
 from ...model import Model
 from ...orderings import PolariserFirst, RetarderFirst
@@ -19,6 +21,11 @@ __all__ = ["Scene", "scene"]
 BOUNDS = {"diattenuation": (-1.0, 1.0), "retardance": (-pi, pi)}
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["likelihood"],
+    meta_fields=["retarder_first", "prior", "constant", "free", "fixed", "values", "copies", "groups", "bounded"],
+)
 @dataclass(frozen=True)
 class Scene:
     """A model in the form in which the fast route evaluates it.
@@ -26,10 +33,10 @@ class Scene:
     ``free`` are the angles that move; ``fixed`` the (cosine, sine) of the others, known while tracing; ``values`` the
     fixed values to report (0 for parameters that drop out). ``copies`` are which of the eight equivalent sets the model
     tells apart, ``groups`` their distinct priors as functions of the point, with the number of copies that share each;
-    the first is that of the point itself. ``bounded`` says that the retardance ends at -pi and pi.
+    the first is that of the point itself. ``bounded`` says that the retardance ends at -pi and pi. Code is compiled for
+    all but the numbers of the likelihood, which are its arguments.
     """
 
-    model: Model
     retarder_first: bool
     likelihood: Likelihood
     prior: tuple[Term | None, ...]
@@ -69,7 +76,6 @@ def scene(model: Model) -> Scene | None:
         fixed.append((Known(cos(angle)), Known(sin(angle))))
         values.append(value)
     return Scene(
-        model=model,
         retarder_first=type(model.ordering) is RetarderFirst,
         likelihood=kind,
         prior=prior,

@@ -155,7 +155,7 @@ def _with_prior(prior: tuple[Term | None, ...], point: Point, phase: _Phase) -> 
     return _Phase(phase.first + found[1], phase.second + found[2], mixed)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(jax.jit, static_argnums=1)
 def _respond(
     scene: Scene, balanced: bool, statistics: Statistics, phase: Any, start: Any, shift: Any, given: Any,
     iterations: Any, one: Any,

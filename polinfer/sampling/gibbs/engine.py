@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri
 
@@ -133,7 +132,7 @@ def _point(problem: Problem, index: np.ndarray, chains: int, apart: list[np.ndar
         if known is not None:
             pairs[2 * i], pairs[2 * i + 1] = known
     pairs = pairs.astype(problem.dtype)
-    return Point(*((jnp.asarray(pairs[2 * i]), jnp.asarray(pairs[2 * i + 1])) for i in range(5)))
+    return Point(*((pairs[2 * i], pairs[2 * i + 1]) for i in range(5)))
 
 
 def _inside(problem: Problem, index: np.ndarray, point: Point) -> Point:
@@ -143,8 +142,8 @@ def _inside(problem: Problem, index: np.ndarray, point: Point) -> Point:
     for prior, pair in zip(problem.plan.prior, point, strict=True):
         found = None if prior is None else prior.evaluate(pair)
         if found is not None:
-            allowed = allowed & jnp.isfinite(found[0])
-    return jax.tree.map(lambda a, b: jnp.where(allowed, a, b), point, unmoved)
+            allowed = allowed & np.isfinite(found[0])
+    return jax.tree.map(lambda a, b: np.where(allowed, a, b), point, unmoved)
 
 
 def _start(problem: Problem, index: np.ndarray, chains: int, numbers: np.ndarray, seed: int, attempt: int) -> State:
@@ -162,16 +161,16 @@ def _start(problem: Problem, index: np.ndarray, chains: int, numbers: np.ndarray
     precision = np.ones(shape, dtype)
     if problem.plan.noise != "known":
         precision = np.broadcast_to(problem.fit["sigma"][index] ** -2.0, shape).astype(dtype)
-    return State(point, jax.tree.map(jnp.asarray, gain), jnp.asarray(precision))
+    return State(point, gain, precision)
 
 
 def _reference(problem: Problem, index: np.ndarray) -> Any:
     """Cosines and sines of what :func:`kernel._aligned` compares, of the fit."""
     value = {name: np.nan_to_num(problem.fit[name][index]) for name in Parameters._fields}
-    found: list[Any] = [jnp.asarray(value["diattenuation"], problem.dtype)]
+    found: list[Any] = [value["diattenuation"].astype(problem.dtype)]
     for name, factor in zip(Parameters._fields[1:], FACTORS[1:], strict=True):
         angle = value[name] * (1.0 if name == "retardance" else factor)
-        found.append(tuple(jnp.asarray(f(angle), problem.dtype) for f in (np.cos, np.sin)))
+        found.append(tuple(f(angle).astype(problem.dtype) for f in (np.cos, np.sin)))
     return tuple(found)
 
 
@@ -263,11 +262,11 @@ def _run(
         count, take = len(own), _span(own)
         index = np.concatenate([own, np.full(size - count, own[0])])
         stream = begin(seed, numbers[index], chains, PURPOSES * attempt)
-        data, reference = jax.tree.map(jnp.asarray, _observed(problem, index)), _reference(problem, index)
+        data, reference = _observed(problem, index), _reference(problem, index)
         state = _start(problem, index, chains, numbers[index], seed, attempt)
         first = jax.tree.map(lambda x: x[:1], state)._replace(point=_point(problem, index, 1))
-        centre = jnp.stack([jnp.broadcast_to(x, (1, size))[0] for x in kernel.invariants(problem.plan, first).values()])
-        stream = jax.tree.map(jnp.asarray, stream)
+        found = kernel.invariants(problem.plan, first).values()
+        centre = np.stack([np.broadcast_to(np.asarray(x), (1, size))[0] for x in found])
         run = (problem.plan, problem.balanced)
         warm = -(-sampler.warmup // store.length)
         for number in range(-warm, store.batches):

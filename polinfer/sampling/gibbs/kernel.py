@@ -101,7 +101,7 @@ def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
     return jnp.stack([jnp.broadcast_to(x, found[0].shape) for x in found]), sign
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(jax.jit, static_argnums=(1, 2))
 def advance(
     plan: Plan, balanced: bool, draws: int, thin: Any, data: Observed, reference: Any, centre: Any, state: State,
     stream: Stream,

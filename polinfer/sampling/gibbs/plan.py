@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from math import asin, cos, pi, sin
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from ...fitting.fast.point import Pair
@@ -55,6 +57,11 @@ class Any1D:
 Shape = Term | Any1D
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["gain_precision", "shape", "scale"],
+    meta_fields=["retarder_first", "gain", "noise", "prior", "free", "fixed", "exchanges", "bounded"],
+)
 @dataclass(frozen=True)
 class Plan:
     """A model in the form in which the sweep evaluates it.
@@ -62,15 +69,16 @@ class Plan:
     ``free`` are the angles that move, ``fixed`` (cosine, sine) of the others. ``gain`` is "unit", "phase" or "complex"
     with ``gain_precision`` 1/t^2; ``noise`` "known", "pixel" or "frame" with the inverse gamma's ``shape`` and
     ``scale``. ``exchanges`` are those of the three exchanges of equivalent sets that change the prior, with the prior
-    as it is behind them. ``bounded``: the retardance ends at -pi and pi.
+    as it is behind them. ``bounded``: the retardance ends at -pi and pi. Code is compiled for all but the numbers of
+    gain and noise, which are its arguments.
     """
 
     retarder_first: bool
     gain: str
-    gain_precision: float
+    gain_precision: Any
     noise: str
-    shape: float
-    scale: float
+    shape: Any
+    scale: Any
     prior: tuple[Shape | None, ...]
     free: tuple[int, ...]
     fixed: tuple[tuple[float, float] | None, ...]
