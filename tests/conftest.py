@@ -23,7 +23,7 @@ if not OPTIMISED and version("jaxlib").startswith("0.10."):
 jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != "0")
 # The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way.
 BLAS = threadpool_limits(1, user_api="blas")
-COMPUTES = ("fibre", "test_streaming.py", "test_demo.py")  # folders and files
+COMPUTES = ("fibre", "test_streaming.py", "test_demo.py", "test_gibbs_steps.py")  # folders and files
 jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
