@@ -25,9 +25,16 @@ jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != 
 BLAS = threadpool_limits(1, user_api="blas")
 COMPUTES = ("fibre", "test_streaming.py", "test_demo.py", "test_gibbs_steps.py")  # folders and files
 jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+CACHE = {
+    "jax_compilation_cache_dir": str(Path(__file__).resolve().parents[1] / ".jax_cache"),
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+for setting, value in CACHE.items():
+    jax.config.update(setting, value)
+# what is compiled here, workers that a test starts need not compile
+os.environ |= {setting.upper(): str(value) for setting, value in CACHE.items()}
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(not OPTIMISED))
 
 # Random input: some 2,000 examples of the parsers in every run, more than 100,000 with POLINFER_FUZZ=fuzz. A machine
 # with other work on it is slow now and then, which is no failure.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from xml.etree.ElementTree import Element, ParseError
 
 import defusedxml.ElementTree
@@ -25,6 +26,7 @@ VALUE_NODES = {
 WHOLE = {"Integer", "IntReg", "MaskedIntReg", "IntConverter", "IntSwissKnife", "Boolean", "Enumeration", "Command"}
 
 
+@lru_cache(maxsize=2)  # a camera that is opened again; nothing changes an element
 def read_nodes(xml: bytes) -> dict[str, Element]:
     """All nodes by name, those in groups too; ProtocolError for XML that is foreign, damaged or too large."""
     if len(xml) > LARGEST:

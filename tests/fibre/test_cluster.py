@@ -11,6 +11,7 @@ import pytest
 
 from fibre import ForwardInverse, Ridge, recover
 from fibre.recovery import base
+from tests.clusters import workers
 
 distributed = pytest.importorskip("distributed", reason="dask is not installed (pip install 'polinfer[cluster]')")
 
@@ -32,9 +33,7 @@ class Broken(Ridge):
 
 @pytest.fixture(scope="module")
 def cluster():
-    with distributed.LocalCluster(
-        n_workers=4, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
-    ) as made:
+    with workers(4) as made:
         yield made
 
 

@@ -8,7 +8,6 @@ import threading
 import time
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 import zarr
@@ -28,6 +27,7 @@ from polinfer import (
     save,
 )
 from polinfer.chunked import Stored
+from tests.clusters import workers
 
 STATES = np.stack([np.ones(3), np.exp(2j * np.pi * np.arange(3) / 3)]) / np.sqrt(2)
 
@@ -136,22 +136,12 @@ def test_an_interrupted_fit_goes_on(tmp_path, monkeypatch):
         fit_stored(Model(), source, tmp_path / "other.zarr", 20)
 
 
-def test_workers_fit_blocks_and_may_be_killed(tmp_path, monkeypatch):
+def test_workers_fit_blocks_and_may_be_killed(tmp_path):
     distributed = pytest.importorskip("distributed", reason="dask is not installed (pip install 'polinfer[cluster]')")
-    # what this process has compiled, workers need not compile
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     measurement = data((40, 30))
     source, target = save(measurement, tmp_path / "data.zarr"), tmp_path / "fit.zarr"
     killed, progress = [], tmp_path / ".fit.zarr.json"
-    with (
-        distributed.LocalCluster(
-            n_workers=4, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
-        ) as cluster,  # fmt: skip
-        distributed.Client(cluster) as client,
-    ):
+    with workers(4) as cluster, distributed.Client(cluster) as client:
         client.wait_for_workers(4)
 
         def kill():
