@@ -9,13 +9,14 @@ from __future__ import annotations
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.optimize
 import scipy.sparse
 import scipy.spatial
+from scipy.linalg.blas import zherk
+from scipy.linalg.lapack import zpotrf, ztrtri
 
 from fibre.fibrelets import lattice_pitch, reference_region
 from fibre.records import Calibration, CalibrationFields
@@ -238,11 +239,21 @@ class _Regressions:
     scaled: np.ndarray
     weight: np.ndarray
 
-    @cached_property
-    def systems(self) -> np.ndarray:
-        r""":math:`G = 1 + T^{1/2} X \, \mathrm{diag}(1/\mathrm{var}) X^H T^{1/2}`, (2, k, 2 q, 2 q)."""
-        products = (self.scaled * self.weight[:, :, None]) @ self.scaled.conj().swapaxes(-1, -2)
-        return np.asarray(products + np.eye(self.root.shape[1]))
+    def roots(self, polarisation: int) -> np.ndarray:
+        r"""W with :math:`W^H W = (1 + T^{1/2} X \, \mathrm{diag}(1/\mathrm{var}) X^H T^{1/2})^{-1}`, (k, 2 q, 2 q)."""
+        size = self.root.shape[1]
+        found = np.empty((len(self.cores), size, size), complex)
+        white = self.scaled * np.sqrt(self.weight[polarisation])[:, None]
+        for rows, root in zip(white, found, strict=True):
+            # triangles only, a quarter of the work of an inverse; Fortran's order turns a matrix into its conjugate
+            system = zherk(1.0, rows.T, trans=2)
+            system.ravel(order="K")[:: size + 1] += 1
+            factor, failed = zpotrf(system, lower=0, overwrite_a=1)
+            inverse, singular = ztrtri(factor, lower=0, overwrite_c=1)
+            if failed or singular:
+                raise np.linalg.LinAlgError("fields and variances of the calibration make no finite system.")
+            root[:] = inverse.T
+        return found
 
 
 def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iterator[_Regressions]:
@@ -315,11 +326,11 @@ def _columns(fields: CalibrationFields, fraction: float, chunk: int) -> Columns:
     for part in _regressions(fields, fraction, chunk):
         real = part.root > 0
         for polarisation in range(2):
-            inverse = np.linalg.inv(part.systems[polarisation])
+            roots = part.roots(polarisation)
             weighted = part.weight[polarisation] * fields.fields[:, polarisation, part.cores].T
             right = np.einsum("kjc,kc->kj", part.scaled.conj(), weighted)
-            found = part.root * np.einsum("kj,kji->ki", right, inverse)
-            left = part.root**2 * np.diagonal(inverse, axis1=1, axis2=2).real
+            found = part.root * np.einsum("kl,kli->ki", np.einsum("kj,klj->kl", right, roots.conj()), roots)
+            left = part.root**2 * (roots.real**2 + roots.imag**2).sum(1)
             rows.append(np.broadcast_to(polarisation * cores + part.cores[:, None], real.shape)[real])
             cols.append(part.chosen[real])
             values.append(found[real])
@@ -359,8 +370,7 @@ def _covariance_roots(
     cores = len(fields.fibrelets.centres)
     for part in _regressions(fields, fraction, chunk):
         for polarisation in range(2):
-            factor = np.linalg.inv(np.linalg.cholesky(part.systems[polarisation]))
-            yield polarisation * cores + part.cores, part.chosen, factor * part.root[:, None]
+            yield polarisation * cores + part.cores, part.chosen, part.roots(polarisation) * part.root[:, None]
 
 
 def usual_response(
