@@ -130,11 +130,9 @@ def draw_map(
     ticks = None if period is None else np.linspace(-0.5, 0.5, 5) * period
     # as high as the map is shown, and as wide as all others
     box, inches = axes.get_position(), axes.figure.get_size_inches()
-    wide = (
-        box.width * inches[0]
-        if long
-        else min(box.width * inches[0], box.height * inches[1] * image.shape[1] / image.shape[0])
-    )
+    wide, tall = box.width * inches[0], box.height * inches[1]
+    if not long:
+        wide = min(wide, tall * image.shape[1] / image.shape[0])
     beside = axes.inset_axes((1 + BAR_GAP / wide, 0, BAR / wide, 1))
     bar = axes.figure.colorbar(drawn, cax=beside, extend=extend, ticks=ticks)
     bar.ax.tick_params(labelsize=7)

@@ -134,8 +134,15 @@ def coverage(measure, truth, make, runs):
     return held / runs
 
 
-@pytest.mark.parametrize("difference", [0.0, 2.0])
-@pytest.mark.parametrize(("units", "runs"), [((9, 6), 150), (None, 60)])
+@pytest.mark.parametrize(
+    ("difference", "units", "runs"),
+    [
+        (0.0, (9, 6), 150),
+        (2.0, None, 60),
+        pytest.param(2.0, (9, 6), 150, marks=pytest.mark.slow),
+        pytest.param(0.0, None, 60, marks=pytest.mark.slow),
+    ],
+)
 def test_intervals_hold_the_truth_as_often_as_they_say(difference, units, runs):
     def make(k):
         if units is None:
