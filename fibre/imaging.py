@@ -42,7 +42,7 @@ class TransmissionImage:
         ``pixel_size``: metres between points, for a scale bar.
         """
         lost = ~np.isfinite(self.amplitude)
-        figure, axes = map_grid(lost, 2, 2, pixel_size, 0.1)
+        figure, axes = map_grid(lost, 2, 2, pixel_size, below=0.1)
         draw_map(axes[0, 0], "amplitude", self.amplitude, lost, high=np.inf, pixel_size=pixel_size)
         draw_map(axes[0, 1], "phase (°)", np.degrees(self.phase), lost, period=360.0, pixel_size=pixel_size)
         draw_map(axes[1, 0], "its standard deviation", self.amplitude_std, lost, high=np.inf, pixel_size=pixel_size)

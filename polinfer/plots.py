@@ -327,7 +327,7 @@ def plot_phantom(phantom: Phantom, pixel_size: float | None = None) -> Figure:
     columns = 7 + (phantom.tilt is not None) + several
     labels = frames[0].labels
     right = max(BESIDE, 0.5 + 0.08 * max(map(len, phantom.names), default=0)) if several else BESIDE
-    figure, grid = map_grid(labels, len(frames), columns, pixel_size, 0.1, right)
+    figure, grid = map_grid(labels, len(frames), columns, pixel_size, below=0.1, right=right)
     for row, frame in zip(grid, frames, strict=True):
         maps: list[tuple[str, Any, float | None]] = [
             ("amplitude", np.abs(frame.gain), None),

@@ -28,7 +28,7 @@ def jones_on_host(ordering: Ordering, parameters: Parameters) -> np.ndarray:
     values = np.broadcast_arrays(*parameters)
     shape, count = values[0].shape, values[0].size
     step = max(1 << max(count.bit_length() - 3, 0), LEAST)
-    row = np.zeros((len(values), -(-count // step) * step), np.result_type(*values, np.float32))
+    row = np.zeros((len(values), -(-max(count, 1) // step) * step), np.result_type(*values, np.float32))
     row[:, :count] = [x.reshape(-1) for x in values]
     return np.asarray(_compiled(ordering, row))[:count].reshape(*shape, 2, 2)
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 import polinfer
 from polinfer.elements import polariser, retarder
-from polinfer.orderings import PolariserFirst, RetarderFirst
+from polinfer.orderings import PolariserFirst, RetarderFirst, on_host
+from polinfer.orderings.on_host import jones_on_host
 from tests.oracles import jones as oracle
 
 ANGLE = st.floats(-7, 7)
@@ -30,6 +31,20 @@ def test_pixels_broadcast():
     matrices = RetarderFirst().jones(p)
     assert matrices.shape == (2, 3, 2, 2)
     np.testing.assert_allclose(matrices[1, 2], oracle.jones((0.1, 0, 1, 0.3, 0)), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (5,), (3, 4), (300,)])
+def test_arrays_of_any_shape_are_computed_in_rows_of_few_lengths(shape):
+    values = np.random.default_rng(1).uniform(-1, 1, (5, *shape))
+    values[1] = 0.3
+    found = jones_on_host(PolariserFirst(), polinfer.Parameters(values[0], 0.3, *values[2:]))
+    expected = [oracle.jones(x, "polariser_first") for x in values.reshape(5, -1).T]
+    np.testing.assert_allclose(found, np.reshape(expected, (*shape, 2, 2)), atol=1e-14)
+    compiled = on_host._compiled._cache_size()
+    jones_on_host(PolariserFirst(), polinfer.Parameters(*values.reshape(5, -1)[:, 1:]))
+    assert on_host._compiled._cache_size() == compiled
+    single = jones_on_host(PolariserFirst(), polinfer.Parameters(*values.astype(np.float32)))
+    assert single.dtype == np.complex64
 
 
 def test_diattenuation_beyond_one_is_nan():

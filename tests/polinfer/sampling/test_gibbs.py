@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -30,6 +31,7 @@ from polinfer import (
 )  # fmt: skip
 from polinfer.sampling import verb
 from polinfer.sampling.gibbs import engine
+from polinfer.sampling.gibbs.plan import plan
 from polinfer.sampling.invariants import invariants
 
 from ..scenes import BALANCED, UNBALANCED
@@ -234,3 +236,13 @@ def test_pixels_whose_chains_do_not_agree_go_to_the_fallback(monkeypatch):
         sample(Model(noise=InferredNoise(2.0, 0.01, "frame")), replace(data, sigma=None), Gibbs(fallback=other))
     with pytest.raises(TypeError, match="fallback must be"):
         Gibbs(fallback=True)
+
+
+def test_gains_and_noises_of_another_size_are_drawn_by_the_same_code():
+    """What the code is compiled for is the structure of a plan; its numbers are leaves."""
+    sizes = [(1.0, 2.0, 1e-3), (2e-4, 0.5, 1e-9)]
+    plans = [plan(Model(gain=ComplexGain(a), noise=InferredNoise(b, c, "pixel"))) for a, b, c in sizes]
+    one, other = (jax.tree.structure(p) for p in plans)
+    assert one == other
+    assert jax.tree.leaves(plans[1]) == pytest.approx([2e-4**-2, 0.5, 1e-9])
+    assert one != jax.tree.structure(plan(Model(gain=PhaseGain(), noise=InferredNoise(2.0, 1e-3, "pixel"))))
