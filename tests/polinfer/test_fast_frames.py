@@ -8,7 +8,10 @@ import pytest
 from polinfer import (
     ComplexGain,
     Measurement,
+    Model,
     Parameters,
+    PhaseGain,
+    PolariserFirst,
     Status,
     fit,
     simulate,
@@ -80,13 +83,21 @@ def test_more_pixels_than_a_block_are_fitted_as_block_by_block():
 
 def test_a_gain_in_another_unit_is_fitted_by_the_same_code():
     (model, data), one = case("skew states"), fitted("skew states")
-    compiled = kernel.from_statistics._cache_size()
+    compiled = kernel.climb_statistics._cache_size()
     scaled = replace(data, response=2e-4 * data.response, sigma=2e-4 * data.sigma)
     other = fit(replace(model, gain=ComplexGain(2e-4 * model.gain.scale)), scaled)
-    assert kernel.from_statistics._cache_size() == compiled
+    assert kernel.climb_statistics._cache_size() == compiled
     for name in Parameters._fields:
         np.testing.assert_allclose(getattr(other.parameters, name), getattr(one.parameters, name), atol=1e-6)
     np.testing.assert_allclose(other.gain, 2e-4 * one.gain, atol=1e-9)
+
+
+def test_both_orderings_and_any_gain_share_the_description_of_a_maximum():
+    data = frame((4,))
+    fit(Model(gain=ComplexGain(1.0)), data)
+    compiled = kernel.described._cache_size()
+    fit(Model(ordering=PolariserFirst(), gain=PhaseGain()), data)
+    assert kernel.described._cache_size() == compiled
 
 
 def test_masked_and_nan_pixels_are_nan_and_leave_the_others_alone():

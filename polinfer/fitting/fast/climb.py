@@ -17,7 +17,7 @@ from .linear import factorise, solve
 from .overlap import coefficients, energy, imaginary, overlap, overlap_slopes, turned
 from .point import Point, matrix, polariser_vector, retarder_vector, rotate, unit
 from .priors import COPIES, Term, log_prior
-from .scene import Scene
+from .scene import Outline, Scene
 
 __all__ = ["Place", "Posterior", "better_copy", "climb", "derivatives", "evaluate", "frozen", "held", "lowest_pivot",
            "moved", "precise_enough", "with_prior"]  # fmt: skip
@@ -82,7 +82,7 @@ def with_prior(prior: tuple[Term | None, ...], point: Point, likelihood: Posteri
     return Posterior(gradient, hessian)
 
 
-def frozen(scene: Scene, point: Point, gradient: dict[int, Any]) -> dict[int, Any]:
+def frozen(scene: Scene | Outline, point: Point, gradient: dict[int, Any]) -> dict[int, Any]:
     """Where a bounded angle lies on its bound and would leave it uphill."""
     found = {}
     if 0 in scene.free:
@@ -105,15 +105,15 @@ def held(posterior: Posterior, stuck: dict[int, Any]) -> Posterior:
     return Posterior(gradient, hessian)
 
 
-def precise_enough(data: Data) -> Any:
+def precise_enough(strength: Any) -> Any:
     """Largest accepted squared Newton decrement; the gradient is rounded like eps times the square of the SNR."""
-    dtype = np.dtype(data.strength.dtype)
-    return tolerance(dtype) + 20 * (jnp.finfo(dtype).eps * data.strength) ** 2
+    dtype = np.dtype(strength.dtype)
+    return tolerance(dtype) + 20 * (jnp.finfo(dtype).eps * strength) ** 2
 
 
-def lowest_pivot(data: Data) -> Any:
+def lowest_pivot(strength: Any) -> Any:
     """Pivots of the Hessian above it may be 0: of a direction of which neither data nor prior say anything."""
-    return -LEAST_CURVATURE - 8 * jnp.finfo(data.strength.dtype).eps * data.strength**2
+    return -LEAST_CURVATURE - 8 * jnp.finfo(strength.dtype).eps * strength**2
 
 
 def _project(scene: Scene, point: Point) -> Point:
@@ -190,7 +190,7 @@ def climb(
         return jax.tree.map(partial(jnp.where, exchange), better_copy(scene, point), point)
 
     eps = jnp.finfo(data.strength.dtype).eps
-    enough, lowest = precise_enough(data), lowest_pivot(data)
+    enough, lowest = precise_enough(data.strength), lowest_pivot(data.strength)
     free, n, shape = scene.free, len(scene.free), data.strength.shape
 
     def look(point: Point) -> Place:

@@ -16,11 +16,12 @@ from .climb import LEAST_CURVATURE, Place, Posterior, frozen, held, lowest_pivot
 from .data import Data
 from .known import ZERO
 from .linear import Triangle, factorise, inverse, solve
-from .point import Point, sine_of_double
+from .point import Pair, Point, sine_of_double
 from .priors import COPIES, FACTORS, log_prior
-from .scene import Scene
+from .scene import Outline, Scene
 
-__all__ = ["CONVERGED", "DOUBTFUL", "FROZEN", "NON_FINITE", "ROUGH", "ROWS", "WIDE", "describe", "rows"]
+__all__ = ["CONVERGED", "DOUBTFUL", "FROZEN", "NON_FINITE", "ROUGH", "ROWS", "WIDE", "Maximum", "describe", "maximum",
+           "rows"]  # fmt: skip
 
 # bits of the flags
 CONVERGED, DOUBTFUL, NON_FINITE, WIDE, ROUGH = 1, 2, 4, 32, 64
@@ -52,7 +53,7 @@ def _lexicographic(left: list[Any], right: list[Any], slack: float) -> Any:
     return found
 
 
-def _choose(scene: Scene, one: Any, point: Point, values: Parameters) -> tuple[Parameters, dict[int, Any]]:
+def _choose(outline: Outline, one: Any, point: Point, values: Parameters) -> tuple[Parameters, dict[int, Any]]:
     """Of the copies with the highest prior the canonical one, and the sign of every angle in it.
 
     Distance and prior are sums over the two elements, so each chooses for itself.
@@ -61,11 +62,11 @@ def _choose(scene: Scene, one: Any, point: Point, values: Parameters) -> tuple[P
     signs: dict[int, Any] = {}
     for indices in ((0, 1), (2, 3, 4)):
         moves, candidates = [], []
-        for row, copy in zip(scene.copies, COPIES, strict=True):
+        for row, copy in zip(outline.copies, COPIES, strict=True):
             move = tuple(copy[i] for i in indices)
             if row and move not in moves:
                 moves.append(move)
-                candidates.append(_candidate(scene, indices, copy, point, values))
+                candidates.append(_candidate(outline, indices, copy, point, values))
         chosen = _best(candidates, values) / one
         for m, i in enumerate(indices):
             value: Any = candidates[0].values[m]
@@ -87,10 +88,10 @@ class _Candidate(NamedTuple):
 
 
 def _candidate(
-    scene: Scene, indices: tuple[int, ...], copy: tuple[tuple[int, float], ...], point: Point, values: Parameters
+    outline: Outline, indices: tuple[int, ...], copy: tuple[tuple[int, float], ...], point: Point, values: Parameters
 ) -> _Candidate:
     part = tuple(
-        None if term is None or i not in indices else term.transformed(*copy[i]) for i, term in enumerate(scene.prior)
+        None if term is None or i not in indices else term.transformed(*copy[i]) for i, term in enumerate(outline.prior)
     )
     found, far = [], 0.0
     for i in indices:
@@ -125,9 +126,9 @@ def _best(candidates: list[_Candidate], values: Parameters) -> Any:
     return number
 
 
-def _values(scene: Scene, one: Any, point: Point) -> Parameters:
+def _values(outline: Outline, one: Any, point: Point) -> Parameters:
     found = []
-    for i, (pair, value) in enumerate(zip(point, scene.values, strict=True)):
+    for i, (pair, value) in enumerate(zip(point, outline.values, strict=True)):
         if value is not None:
             found.append(jnp.full_like(one, value))
         else:
@@ -135,31 +136,48 @@ def _values(scene: Scene, one: Any, point: Point) -> Parameters:
     return Parameters(*found)
 
 
-def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[Any, Any]:
-    """The rows of the result and the flags of every pixel at a place with the derivatives of the log posterior there.
+class Maximum(NamedTuple):
+    """What a climb has reached: the point, the mean gain (None: there is none) and the log posterior there, the squared
+    residual of all data, ``|Y|`` and the derivatives of the log posterior."""
+
+    point: Point
+    gain: Pair | None
+    value: Any
+    square: Any
+    strength: Any
+    whole: Posterior
+
+
+def maximum(scene: Scene, data: Data, place: Place, whole: Posterior) -> Maximum:
+    """A place and the derivatives there in the terms that all models share."""
+    point, at, value = place
+    return Maximum(point, scene.likelihood.mean_gain(at), value, at.square + data.residual, data.strength, whole)
+
+
+def describe(outline: Outline, one: Any, top: Maximum) -> tuple[Any, Any]:
+    """The rows of the result and the flags of every pixel; ``one`` is that of :class:`Data`.
 
     The covariance is that of the parameters. Where the maximum lies on a bound (``FROZEN``) the rows of that parameter
     hold instead how the others follow the bounded angle y, and the inverse curvature along y; then the evidence leaves
     that angle out. ``ROUGH`` marks a maximum that rounding may have missed by more than the precision promises.
     """
-    point, at, value = place
-    gain: Any = scene.likelihood.mean_gain(at)
-    if 2 in scene.free and not scene.bounded:  # the other sign of J, which a free phase takes up
+    point, gain, value, square, strength, whole = top
+    if 2 in outline.free and not outline.bounded:  # the other sign of J, which a free phase takes up
         c, s = point.retardance
         down = c < 0
         point = point._replace(retardance=(jnp.where(down, -c, c), jnp.where(down, -s, s)))
-        gain = None if gain is None else tuple(jnp.where(down, -x, x) for x in gain)
-    stuck = frozen(scene, point, whole.gradient)
+        gain = None if gain is None else (jnp.where(down, -gain[0], gain[0]), jnp.where(down, -gain[1], gain[1]))
+    stuck = frozen(outline, point, whole.gradient)
     local = held(whole, stuck)
-    free, n = scene.free, len(scene.free)
+    free, n = outline.free, len(outline.free)
     at_index = {i: m for m, i in enumerate(free)}
     a = {(m, k): -local.hessian[i, j] for m, i in enumerate(free) for k, j in enumerate(free) if m <= k}
     factor = factorise(a, n, LEAST_CURVATURE)
     lower, smallest = factor.lower, factor.smallest
     _, decrement = solve(lower, [local.gradient[i] for i in free])
-    c = {key: x / data.one for key, x in inverse(lower, n).items()}
+    c = {key: x / one for key, x in inverse(lower, n).items()}
     c |= {(k, m): x for (m, k), x in c.items()}
-    flags = jnp.where((decrement < precise_enough(data)) & (smallest > lowest_pivot(data)), CONVERGED, 0)
+    flags = jnp.where((decrement < precise_enough(strength)) & (smallest > lowest_pivot(strength)), CONVERGED, 0)
     finite = jnp.isfinite(value)
     # angles of J itself do not depend on how well axes are defined
     sine = [jnp.ones_like(value), point.diattenuation[1], jnp.ones_like(value), point.retardance[1],
@@ -172,19 +190,19 @@ def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[
         loosest = jnp.maximum(loosest, jnp.where(stuck[i], 0, loose) if i in stuck else loose)
     # what is lost where a gradient that is rounding alone still moves a loose angle: twice the nats
     eps = float(jnp.finfo(value.dtype).eps)
-    rough = (ROUNDING * eps * data.strength**2) ** 2 * loosest > (5e-4 if eps < 1e-10 else 5e-3)
+    rough = (ROUNDING * eps * strength**2) ** 2 * loosest > (5e-4 if eps < 1e-10 else 5e-3)
 
     # evidence: this point's own prior, then those of the copies
     cosine = point.diattenuation[0] ** 2 - point.diattenuation[1] ** 2  # cos delta
     log_volume = _log_volume(free, lower, stuck, cosine)
-    total, doubtful = jnp.full_like(value, log(scene.groups[0][1])), jnp.zeros(value.shape, bool)
-    own = log_prior(scene.prior, point)
-    for prior, count in scene.groups[1:]:
+    total, doubtful = jnp.full_like(value, log(outline.groups[0][1])), jnp.zeros(value.shape, bool)
+    own = log_prior(outline.prior, point)
+    for prior, count in outline.groups[1:]:
         b = dict(a)
         change: list[Any] = [ZERO] * n
-        differ = [i for i in free if prior[i] != scene.prior[i]]
+        differ = [i for i in free if prior[i] != outline.prior[i]]
         for i in differ:
-            slope, bend = _difference(prior[i], scene.prior[i], point[i])
+            slope, bend = _difference(prior[i], outline.prior[i], point[i])
             m = at_index[i]
             change[m], b[m, m] = slope, b[m, m] - bend
             if i in stuck:
@@ -216,12 +234,12 @@ def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[
             c[m, k] = c[k, m] = jnp.where(where, follow[k], c[k, m])
         c[m, m] = jnp.where(where, 1 / curvature, c[m, m])
 
-    values = _values(scene, jnp.ones_like(value), point)
+    values = _values(outline, jnp.ones_like(value), point)
     if 0 in stuck:  # on the bound, not an ulp off it: the density falls by a square root from there
         values = values._replace(
             diattenuation=jnp.where(stuck[0], jnp.sign(values.diattenuation), values.diattenuation)
         )
-    parameters, signs = _choose(scene, data.one, point, values)
+    parameters, signs = _choose(outline, one, point, values)
     widths = [2 * cosine, 0.5, 2.0, 0.5, 1.0]
     if 0 in stuck:
         widths[0] = jnp.where(stuck[0], 1.0, widths[0])
@@ -233,7 +251,7 @@ def describe(scene: Scene, data: Data, place: Place, whole: Posterior) -> tuple[
     covariance = scale[:, None] * scale * jnp.stack(each).reshape(5, 5, -1)
     std = jnp.abs(scale) * jnp.sqrt(jnp.stack(each[::6]))
     slopes = [jnp.where(stuck[i], jnp.abs(whole.gradient[i]), 0) if i in stuck else zero for i in (0, 2)]
-    rest = [value, evidence, 2 * (at.square + data.residual), *slopes, *(() if gain is None else gain)]
+    rest = [value, evidence, 2 * square, *slopes, *(() if gain is None else gain)]
     return jnp.concatenate([jnp.stack(parameters), std, covariance.reshape(25, -1), jnp.stack(rest)]), flags
 
 

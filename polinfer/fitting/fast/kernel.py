@@ -1,4 +1,8 @@
-"""The compiled code: from data to the rows of the result, a block of pixels at a time."""
+"""The compiled code: from data to the rows of the result, a block of pixels at a time.
+
+In two parts: the climb, and the description of where it has ended, which models of both orderings and of any gain have
+in common.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +17,12 @@ import numpy as np
 from ...statistics import Statistics
 from .climb import climb
 from .data import Data, Matrix, prepare
-from .describe import describe
+from .describe import Maximum, describe, maximum
 from .scene import Scene
 from .start import closed_form
 
-__all__ = ["CLOSED_FORM", "GIVEN", "PATIENT", "STAY", "Shared", "from_responses", "from_statistics", "no_start"]
+__all__ = ["CLOSED_FORM", "GIVEN", "PATIENT", "STAY", "Shared", "climb_responses", "climb_statistics", "described",
+           "from_responses", "from_statistics", "no_start"]  # fmt: skip
 
 # where a climb starts: in the closed form, or in a point that is given; whether it may change to another copy of it;
 # and whether it is patient, which narrow curved valleys need, but which may lead to another maximum
@@ -45,16 +50,18 @@ def _parts(a: Any) -> Matrix:
     return [[(jnp.real(a[..., i, j]), jnp.imag(a[..., i, j])) for j in (0, 1)] for i in (0, 1)]
 
 
-def _finish(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, iterations: Any) -> tuple[Any, Any]:
+def _climb(scene: Scene, balanced: bool, data: Data, start: Any, given: Any, iterations: Any) -> Maximum:
     closed = closed_form(scene, data)
     # a start may come from another model: what is fixed stays
     told = start if len(scene.free) == 5 else jnp.stack([start[2 * i + k] for i in scene.free for k in (0, 1)])
     begun = jnp.where(given != CLOSED_FORM, told, jnp.stack(jax.tree.leaves(closed)))
     patience = jnp.where(given == PATIENT, PATIENCE, 0)
-    return describe(scene, data, *climb(scene, balanced, data, begun, iterations, given != STAY, patience))
+    return maximum(scene, data, *climb(scene, balanced, data, begun, iterations, given != STAY, patience))
 
 
-@partial(jax.jit, static_argnums=1)
+described = jax.jit(describe, static_argnums=0)
+
+
 def from_statistics(
     scene: Scene, balanced: bool, statistics: Statistics, start: Any, given: Any, iterations: Any, one: Any
 ) -> tuple[Any, Any]:
@@ -62,6 +69,16 @@ def from_statistics(
 
     ``start`` (10, pixels) are (cosine, sine) of the five angles; ``given`` says how they are used.
     """
+    top = climb_statistics(scene, balanced, statistics, start, given, iterations, one)
+    found: tuple[Any, Any] = described(scene.outline, one, top)
+    return found
+
+
+@partial(jax.jit, static_argnums=1)
+def climb_statistics(
+    scene: Scene, balanced: bool, statistics: Statistics, start: Any, given: Any, iterations: Any, one: Any
+) -> Maximum:
+    """The climb of :func:`from_statistics`."""
     data = prepare(
         balanced,
         _parts(statistics.illumination),
@@ -70,22 +87,25 @@ def from_statistics(
         statistics.constant,
         one,
     )
-    return _finish(scene, balanced, data, start, given, iterations)
+    return _climb(scene, balanced, data, start, given, iterations)
+
+
+def from_responses(
+    scene: Scene, balanced: bool, response: Any, sigma: Any, shared: Shared, start: Any, given: Any, iterations: Any,
+    one: Any,
+) -> tuple[Any, Any]:  # fmt: skip
+    """The same from the responses ``(pixels, 2, n)`` themselves, where all pixels share the illumination."""
+    top = climb_responses(scene, balanced, response, sigma, shared, start, given, iterations, one)
+    found: tuple[Any, Any] = described(scene.outline, one, top)
+    return found
 
 
 @partial(jax.jit, static_argnums=1)
-def from_responses(
-    scene: Scene,
-    balanced: bool,
-    response: Any,
-    sigma: Any,
-    shared: Shared,
-    start: Any,
-    given: Any,
-    iterations: Any,
+def climb_responses(
+    scene: Scene, balanced: bool, response: Any, sigma: Any, shared: Shared, start: Any, given: Any, iterations: Any,
     one: Any,
-) -> tuple[Any, Any]:
-    """The same from the responses ``(pixels, 2, n)`` themselves, where all pixels share the illumination.
+) -> Maximum:  # fmt: skip
+    """The climb of :func:`from_responses`.
 
     ``Y = V Q^H`` and ``E = |V - Y Q|^2`` are formed on the way, the residual directly.
     """
@@ -121,4 +141,4 @@ def from_responses(
     constant = shared.log_weight - shared.count * jnp.log(pi * sigma * sigma) - residual
     root = [[(re * inverse, im * inverse) for re, im in row] for row in _parts(shared.root)]
     data = prepare(balanced, root, y, residual, constant, one)
-    return _finish(scene, balanced, data, start, given, iterations)
+    return _climb(scene, balanced, data, start, given, iterations)

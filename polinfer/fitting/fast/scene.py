@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from math import asin, cos, pi, sin
 
 import jax
@@ -16,9 +16,21 @@ from .known import Known
 from .likelihoods import Likelihood, likelihood
 from .priors import FACTORS, Term, copies, terms
 
-__all__ = ["Scene", "scene"]
+__all__ = ["Outline", "Scene", "scene"]
 
 BOUNDS = {"diattenuation": (-1.0, 1.0), "retardance": (-pi, pi)}
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Of a scene what the description of a maximum depends on: the fields as there, neither ordering nor likelihood."""
+
+    prior: tuple[Term | None, ...]
+    free: tuple[int, ...]
+    values: tuple[float | None, ...]
+    copies: tuple[bool, ...]
+    groups: tuple[tuple[tuple[Term | None, ...], int], ...]
+    bounded: bool
 
 
 @partial(
@@ -47,6 +59,11 @@ class Scene:
     copies: tuple[bool, ...]
     groups: tuple[tuple[tuple[Term | None, ...], int], ...]
     bounded: bool
+
+    @cached_property
+    def outline(self) -> Outline:
+        """See :class:`Outline`."""
+        return Outline(self.prior, self.free, self.values, self.copies, self.groups, self.bounded)
 
 
 @lru_cache(maxsize=256)
