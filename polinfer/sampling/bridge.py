@@ -65,10 +65,9 @@ class Proposal:
 
     def log_density(self, points: np.ndarray, prior: np.ndarray | None = None) -> np.ndarray:
         """Normalised log density ``(n,)`` of points ``(n, k)``; ``prior`` is ``log_prior`` there if it is known."""
-        terms = [log(self.defence) + (self.log_prior(points) if prior is None else prior)]
-        for share, mean, root in zip(self.shares, self.means, self.roots, strict=True):
-            terms.append(log((1 - self.defence) * share) + _log_student(points, mean, root))
-        return np.asarray(np.logaddexp.reduce(np.stack(terms), axis=0))
+        defence = log(self.defence) + (self.log_prior(points) if prior is None else prior)
+        terms = np.log((1 - self.defence) * self.shares)[:, None] + _log_students(points, self.means, self.roots)
+        return np.asarray(np.logaddexp.reduce(np.concatenate([defence[None], terms]), axis=0))
 
 
 def defended(target: Target, mixture: tuple[np.ndarray, np.ndarray, np.ndarray], defence: float) -> Proposal:
@@ -80,16 +79,21 @@ def defended(target: Target, mixture: tuple[np.ndarray, np.ndarray, np.ndarray],
     return Proposal(*mixture, defence, draw, lambda points: target.evaluate(points)[1])
 
 
-def _log_student(points: np.ndarray, mean: np.ndarray, root: np.ndarray) -> np.ndarray:
-    k = len(mean)
-    rest, square = points - mean, np.zeros(len(points))
+def _log_students(points: np.ndarray, means: np.ndarray, roots: np.ndarray) -> np.ndarray:
+    """Log densities ``(components, n)`` of the components at points ``(n, k)``."""
+    k = means.shape[1]
+    rest, square = points.T - means[:, :, None], np.zeros((len(means), len(points)))
     whitened: list[np.ndarray] = []
-    for i in range(k):  # by substitution; a library would start threads for so small a matrix
-        column = (rest[:, i] - sum(root[i, j] * whitened[j] for j in range(i))) / root[i, i]
+    for i in range(k):  # by substitution; a library would start threads for so small matrices
+        column = rest[:, i]
+        for j in range(i):
+            column -= roots[:, i, j, None] * whitened[j]
+        column /= roots[:, i, i, None]
         whitened.append(column)
         square += column**2
     constant = lgamma(0.5 * (FREEDOM + k)) - lgamma(0.5 * FREEDOM) - 0.5 * k * log(pi * FREEDOM)
-    return constant - np.sum(np.log(np.diag(root))) - 0.5 * (FREEDOM + k) * np.log1p(square / FREEDOM)
+    constants = constant - np.log(np.einsum("cii->ci", roots)).sum(axis=1)
+    return np.asarray(constants[:, None] - 0.5 * (FREEDOM + k) * np.log1p(square / FREEDOM))
 
 
 def fit_mixture(
@@ -108,7 +112,7 @@ def fit_mixture(
     covariances = np.broadcast_to(np.cov(z.T).reshape(k, k) + ridge, (components, k, k)).copy()
     for _ in range(EM_ROUNDS if components > 1 else 1):
         roots = np.linalg.cholesky(covariances)
-        logs = np.stack([log(s) + _log_student(z, m, r) for s, m, r in zip(shares, means, roots, strict=True)])
+        logs = np.log(shares)[:, None] + _log_students(z, means, roots)
         weights = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
         total = weights.sum(axis=1) + 1e-9
         shares = np.maximum(total / n, 1e-3)
@@ -116,7 +120,7 @@ def fit_mixture(
         means = weights @ z / total[:, None]
         offset = z[None] - means[:, None]
         # few points say little about a matrix: the prior's weight is that of k + 1 points
-        shrunk = np.einsum("cn,cni,cnj->cij", weights, offset, offset) + (k + 1) * ridge
+        shrunk = np.swapaxes(weights[..., None] * offset, 1, 2) @ offset + (k + 1) * ridge
         covariances = shrunk / (total + k + 1)[:, None, None] + 1e-9 * np.eye(k)
     roots = np.linalg.cholesky(covariances)
     return shares, centre + scale * means, scale[:, None] * roots
@@ -151,8 +155,8 @@ class Bridge(NamedTuple):
     error: float
 
 
-def bridge(target: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, values: np.ndarray, proposal: Proposal,
-           rng: np.random.Generator, points: int = 1) -> Bridge:  # fmt: skip
+def bridge(target: Target, draws: np.ndarray, values: np.ndarray, proposal: Proposal, rng: np.random.Generator,
+           points: int = 1) -> Bridge:  # fmt: skip
     """Evidence of ``target`` from draws ``(chain, time, walker, k)`` and its logarithm ``values`` there.
 
     The proposal must not be made of the same draws; ``points`` times as many points are drawn from it.
@@ -161,7 +165,8 @@ def bridge(target: Callable[[np.ndarray], np.ndarray], draws: np.ndarray, values
     flat = draws.reshape(-1, draws.shape[-1])
     other = proposal.draw(rng, points * len(flat))
     first = values.reshape(-1) - proposal.log_density(flat)
-    second = target(other) - proposal.log_density(other)
+    density, prior = target.evaluate(other)
+    second = density - proposal.log_density(other, prior)
     effective = len(flat) / autocorrelation_time(values)
     share = effective / (effective + len(other))
     guess = float(np.logaddexp.reduce(second) - log(len(other)))
