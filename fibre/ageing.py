@@ -73,6 +73,8 @@ def _compare(inverse: Inverse, probes: CalibrationFields) -> _Comparison:
             raise ValueError(f"probes must have the {name} of the inverse's calibration; retrieve them with those.")
     inputs = probes.inputs.toarray()
     fraction = _fraction(old, inputs, probes.variance)
+    # before the columns, which are made of the same roots
+    covariances = response_covariance(old, inputs, fraction)
     known = columns(old, fraction)
     used = np.flatnonzero(np.diff(known.values.indptr) > 0)
     count = len(probes.fields)
@@ -81,7 +83,7 @@ def _compare(inverse: Inverse, probes: CalibrationFields) -> _Comparison:
     piston = np.angle(np.sum(expected.conj() * seen / noise, axis=1))
     left = seen * np.exp(-1j * piston)[:, None] - expected
     # errors of A are in the expected fields, for all probes the same ones
-    unknown = response_covariance(old, inputs, fraction)[used].swapaxes(1, 2)
+    unknown = covariances[used].swapaxes(1, 2)
     covariance = unknown + noise.T[..., None] * np.eye(count)
     usual = usual_response(old, inputs, fraction)[used].swapaxes(1, 2)
     return _Comparison(left.T, covariance, usual, piston)

@@ -322,19 +322,17 @@ def columns(fields: CalibrationFields, fraction: float = FAINT, chunk: int = 128
 
 def _columns(fields: CalibrationFields, fraction: float, chunk: int) -> Columns:
     count, cores = len(fields.points), len(fields.fibrelets.centres)
+    inputs = np.vstack([fields.inputs.toarray().conj(), np.zeros(fields.inputs.shape[1])])
+    weighted = (fields.fields / fields.variance).reshape(-1, 2 * cores).T
     rows, cols, values, variances = [], [], [], []
-    for part in _regressions(fields, fraction, chunk):
-        real = part.root > 0
-        for polarisation in range(2):
-            roots = part.roots(polarisation)
-            weighted = part.weight[polarisation] * fields.fields[:, polarisation, part.cores].T
-            right = np.einsum("kjc,kc->kj", part.scaled.conj(), weighted)
-            found = part.root * np.einsum("kl,kli->ki", np.einsum("kj,klj->kl", right, roots.conj()), roots)
-            left = part.root**2 * (roots.real**2 + roots.imag**2).sum(1)
-            rows.append(np.broadcast_to(polarisation * cores + part.cores[:, None], real.shape)[real])
-            cols.append(part.chosen[real])
-            values.append(found[real])
-            variances.append(left[real])
+    for own, chosen, roots in _covariance_roots(fields, fraction, chunk):
+        real = chosen < 2 * count
+        right = np.einsum("kjc,kc->kj", inputs[chosen], weighted[own])
+        found = np.einsum("kl,kli->ki", np.einsum("kj,klj->kl", right, roots.conj()), roots)
+        rows.append(np.broadcast_to(own[:, None], real.shape)[real])
+        cols.append(chosen[real])
+        values.append(found[real])
+        variances.append((roots.real**2 + roots.imag**2).sum(1)[real])
     place = (np.concatenate(rows), np.concatenate(cols))
     shape = (2 * cores, 2 * count)
     return Columns(
@@ -356,18 +354,29 @@ def response_covariance(
     inputs = np.vstack([inputs, np.zeros(inputs.shape[1])])
     cores = len(fields.fibrelets.centres)
     covariance = np.zeros((2 * cores, inputs.shape[1], inputs.shape[1]), complex)
-    name = f"roots of the covariance, {fraction!r}"
-    for rows, chosen, roots in _once(fields, name, lambda: list(_covariance_roots(fields, fraction, chunk))):
+    kept = _once(fields, _roots_name(fraction), lambda: list(_covariance_roots(fields, fraction, chunk)))
+    for rows, chosen, roots in kept:
         whitened = roots @ inputs[chosen]
         covariance[rows] = whitened.conj().swapaxes(-1, -2) @ whitened
     return covariance
 
 
+def _roots_name(fraction: float) -> str:
+    return f"roots of the covariance, {fraction!r}"
+
+
 def _covariance_roots(
     fields: CalibrationFields, fraction: float, chunk: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    r"""Rows of A (k,), the inputs that reach them (k, 2 q), and roots of their covariance: :math:`\Sigma = W^H W`."""
+    r"""Rows of A (k,), the inputs that reach them (k, 2 q), and roots of their covariance: :math:`\Sigma = W^H W`.
+
+    They are large, so that only :func:`response_covariance`, which asks for them again and again, keeps them; once they
+    are there they serve :func:`columns` too.
+    """
     cores = len(fields.fibrelets.centres)
+    if (kept := _MADE.get(id(fields), {}).get(_roots_name(fraction))) is not None:
+        yield from kept
+        return
     for part in _regressions(fields, fraction, chunk):
         for polarisation in range(2):
             yield polarisation * cores + part.cores, part.chosen, part.roots(polarisation) * part.root[:, None]

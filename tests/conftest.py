@@ -25,7 +25,9 @@ if not OPTIMISED and version("jaxlib").startswith("0.10."):
 gc.set_threshold(100_000, 20, 20)
 # The library never decides about precision; its tests run in double unless told otherwise.
 jax.config.update("jax_enable_x64", os.environ.get("POLINFER_TEST_X64", "1") != "0")
-# The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way.
+# The tests run in as many processes as there are cores: threads of BLAS beside them only get into each other's way. A
+# library that is here already is told so, one that is loaded later, such as SciPy's, and processes of tests read it.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 BLAS = threadpool_limits(1, user_api="blas")
 COMPUTES = ("fibre", "test_streaming.py", "test_demo.py", "test_gibbs_steps.py")  # folders and files
 jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
