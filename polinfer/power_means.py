@@ -24,6 +24,7 @@ STRETCH = 0.5
 SEPARATION = 8
 
 
+@jax.jit
 def log_phase_mean(power: Any, ratio: Any) -> jax.Array:
     """``log of (1 / 2 pi) integral (1 + ratio sin^2(phi / 2))^-power dphi`` over a period, element by element.
 
@@ -45,6 +46,7 @@ def log_phase_mean(power: Any, ratio: Any) -> jax.Array:
     return logsumexp(weight - power * jnp.log1p(ratio * square), axis=-1)
 
 
+@jax.jit
 def log_gain_mean(power: Any, rest: Any, signal: Any, width: Any) -> jax.Array:
     """``log of E (1 + rest + |x - sqrt(signal)|^2)^-power`` with ``x ~ CN(0, width)``, element by element.
 

@@ -33,7 +33,7 @@ COMPUTES = ("fibre", "test_streaming.py", "test_demo.py", "test_gibbs_steps.py")
 jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
 CACHE = {
     "jax_compilation_cache_dir": str(Path(__file__).resolve().parents[1] / ".jax_cache"),
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_compile_time_secs": 0.5,  # to store one takes 0.03
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
 for setting, value in CACHE.items():
