@@ -35,7 +35,7 @@ __all__ = ["Problem", "draw_gibbs", "part_of", "problem_of"]
 
 BLOCKS, FEW = (16, 512), 128  # numbers of pixels for which code is compiled; up to FEW pixels take small ones
 ACCELERATOR = (128, 1024, 1 << 14)  # the same where thousands of threads work side by side
-BATCH, LEAST_BATCHES = 25, 8  # draws that are made in one go, and how many batches the diagnostics have at least
+LEAST_BATCHES = 8  # that the diagnostics have
 MORE = (2, 4, 16)  # how many times as many sweeps for a draw are tried where chains have not converged
 LARGEST_R = 1.05
 NEAR = 1.7  # times the effective draws that are asked for: where batches find fewer, they are counted more exactly
@@ -185,8 +185,8 @@ class _Chains:
             self.gain = np.empty((chains, draws, pixels), np.result_type(dtype, np.complex64))
         self.precision = None if problem.plan.noise == "known" else np.empty((chains, draws, pixels), dtype)
         self.sums: np.ndarray | None = None
-        # all batches have the same length, for which code is compiled; what is left of the last is dropped
-        self.length = min(BATCH, -(-draws // LEAST_BATCHES))
+        # all batches have the same length; what is left of the last is dropped
+        self.length = min(kernel.BATCH, -(-draws // LEAST_BATCHES))
         self.batches = -(-draws // self.length)
 
     def store(self, number: int, take: Any, count: int, batch: kernel.Batch) -> None:

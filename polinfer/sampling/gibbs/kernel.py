@@ -16,14 +16,16 @@ from .plan import Plan
 from .random import Random, Stream
 from .sweep import Observed, State, sweep
 
-__all__ = ["Batch", "advance", "invariants"]
+__all__ = ["BATCH", "Batch", "advance", "invariants"]
+
+BATCH = 25  # draws of a batch, at most
 
 
 class Batch(NamedTuple):
-    """Consecutive draws ``(draws, 5, chains, pixels)``, of the gain and of ``1 / sigma^2`` ``(draws, chains, pixels)``.
+    """Consecutive draws ``(BATCH, 5, chains, pixels)``, of the gain and of ``1 / sigma^2`` ``(BATCH, chains, pixels)``.
 
-    The last two are None where there is nothing to infer. ``sums`` of the invariants less a constant and of their
-    squares, ``(2, invariants, chains, pixels)``.
+    Those beyond the number of draws are 0; the last two are None where there is nothing to infer. ``sums`` of the
+    invariants less a constant and of their squares, ``(2, invariants, chains, pixels)``.
     """
 
     parameters: Any
@@ -101,12 +103,15 @@ def _aligned(plan: Plan, reference: Any, point: Point) -> tuple[Any, Any]:
     return jnp.stack([jnp.broadcast_to(x, found[0].shape) for x in found]), sign
 
 
-@partial(jax.jit, static_argnums=(1, 2))
+@partial(jax.jit, static_argnums=1)
 def advance(
-    plan: Plan, balanced: bool, draws: int, thin: Any, data: Observed, reference: Any, centre: Any, state: State,
+    plan: Plan, balanced: bool, draws: Any, thin: Any, data: Observed, reference: Any, centre: Any, state: State,
     stream: Stream,
 ) -> tuple[State, Stream, Batch]:  # fmt: skip
-    """``draws`` draws, ``thin`` sweeps apart; ``centre`` (invariants, pixels) is taken off the invariants."""
+    """``draws`` draws, ``thin`` sweeps apart; ``centre`` (invariants, pixels) is taken off the invariants.
+
+    The draws come in arrays of ``BATCH``, whatever their number: code is compiled for one size.
+    """
     dtype = data.residual.dtype
 
     def one(_: Any, carry: Any) -> Any:
@@ -115,16 +120,21 @@ def advance(
         state = sweep(plan, balanced, data, state, random)
         return state, random.stream
 
-    def step(carry: Any, _: Any) -> Any:
-        state, stream, sums = carry
+    def told(state: State) -> tuple[Any, Any, Any]:
+        parameters, sign = _aligned(plan, reference, state.point)
+        gain = None if plan.gain == "unit" else jnp.stack([sign * state.gain[0], sign * state.gain[1]])
+        return parameters, gain, None if plan.noise == "known" else state.precision
+
+    def step(k: Any, carry: Any) -> Any:
+        state, stream, sums, kept = carry
         state, stream = jax.lax.fori_loop(0, thin, one, (state, stream))
         found, shape = invariants(plan, state), state.precision.shape
         off = jnp.stack([jnp.broadcast_to(x, shape) - c for x, c in zip(found.values(), centre, strict=True)])
-        parameters, sign = _aligned(plan, reference, state.point)
-        gain = None if plan.gain == "unit" else jnp.stack([sign * state.gain[0], sign * state.gain[1]])
-        precision = None if plan.noise == "known" else state.precision
-        return (state, stream, sums + jnp.stack([off, off * off])), (parameters, gain, precision)
+        kept = jax.tree.map(lambda room, new: jax.lax.dynamic_update_index_in_dim(room, new, k, 0), kept, told(state))
+        return state, stream, sums + jnp.stack([off, off * off]), kept
 
-    zero = jnp.zeros((2, len(centre), *state.precision.shape), dtype)
-    (state, stream, sums), (parameters, gain, precision) = jax.lax.scan(step, (state, stream, zero), None, length=draws)
+    sums = jnp.zeros((2, len(centre), *state.precision.shape), dtype)
+    kept = jax.tree.map(lambda x: jnp.zeros((BATCH, *x.shape), x.dtype), jax.eval_shape(told, state))
+    state, stream, sums, kept = jax.lax.fori_loop(0, draws, step, (state, stream, sums, kept))
+    parameters, gain, precision = kept
     return state, stream, Batch(parameters, gain, precision, sums)

@@ -30,7 +30,7 @@ from polinfer import (
     simulate,
 )  # fmt: skip
 from polinfer.sampling import verb
-from polinfer.sampling.gibbs import engine
+from polinfer.sampling.gibbs import engine, kernel
 from polinfer.sampling.gibbs.plan import plan
 from polinfer.sampling.invariants import invariants
 
@@ -246,3 +246,16 @@ def test_gains_and_noises_of_another_size_are_drawn_by_the_same_code():
     assert one == other
     assert jax.tree.leaves(plans[1]) == pytest.approx([2e-4**-2, 0.5, 1e-9])
     assert one != jax.tree.structure(plan(Model(gain=PhaseGain(), noise=InferredNoise(2.0, 1e-3, "pixel"))))
+
+
+def test_another_number_of_draws_is_made_by_the_same_code():
+    """Batches of fewer draws are the first ones of full batches."""
+    data = simulate(Model(), Parameters(*(np.full(2, x) for x in (0.3, 0.5, 1.1, 0.4, 0.4))), BALANCED, 0.05, rng=2)
+    sample(Model(), data, Gibbs(evidence=False), draws=200, rng=1)
+    compiled = kernel.advance._cache_size()
+    sample(Model(), data, Gibbs(evidence=False), draws=101, rng=1)
+    assert kernel.advance._cache_size() == compiled
+    # 8 batches of 13 draws and 8 of 25 take as many sweeps to warm up where that is a multiple of both
+    warm = replace(Gibbs(evidence=False), warmup=13 * 25)
+    many, few = (sample(Model(), data, warm, draws=n, rng=1) for n in (200, 101))
+    np.testing.assert_array_equal(few.parameters.retardance, many.parameters.retardance[:, :101])
