@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import isclose, pi
 from typing import Any
@@ -283,10 +283,11 @@ class Model:
         pixels = np.broadcast_to(np.arange(summary.masked.size).reshape(summary.masked.shape), shape).reshape(-1)
         spread = [jnp.broadcast_to(value, shape).reshape(-1) for value in given]
         parts = [jnp.zeros(0, spread[0].dtype)]
+        apart = replace(self, neighbours=None)  # statistics are pooled: windows of all sizes share compiled code
         for begin in range(0, len(pixels), BLOCK):
             part = slice(begin, begin + BLOCK)
             statistics = as_device(pooled.take(pixels[part]), dtype)
-            parts.append(function(self, Parameters(*(value[part] for value in spread)), statistics))
+            parts.append(function(apart, Parameters(*(value[part] for value in spread)), statistics))
         return jnp.concatenate(parts[1:] or parts).reshape(shape)
 
     def pool(self, summary: Summary) -> Pooled:
