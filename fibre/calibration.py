@@ -17,6 +17,7 @@ import scipy.sparse
 import scipy.spatial
 from scipy.linalg.blas import zherk
 from scipy.linalg.lapack import zpotrf, ztrtri
+from threadpoolctl import threadpool_limits
 
 from fibre.fibrelets import lattice_pitch, reference_region
 from fibre.records import Calibration, CalibrationFields
@@ -244,15 +245,17 @@ class _Regressions:
         size = self.root.shape[1]
         found = np.empty((len(self.cores), size, size), complex)
         white = self.scaled * np.sqrt(self.weight[polarisation])[:, None]
-        for rows, root in zip(white, found, strict=True):
-            # triangles only, a quarter of the work of an inverse; Fortran's order turns a matrix into its conjugate
-            system = zherk(1.0, rows.T, trans=2)
-            system.ravel(order="K")[:: size + 1] += 1
-            factor, failed = zpotrf(system, lower=0, overwrite_a=1)
-            inverse, singular = ztrtri(factor, lower=0, overwrite_c=1)
-            if failed or singular:
-                raise np.linalg.LinAlgError("fields and variances of the calibration make no finite system.")
-            root[:] = inverse.T
+        # threads that wait for each other take twice as long for matrices as small as these
+        with threadpool_limits(1, user_api="blas"):
+            for rows, root in zip(white, found, strict=True):
+                # triangles only, a quarter of the work of an inverse; Fortran's order turns a matrix into its conjugate
+                system = zherk(1.0, rows.T, trans=2)
+                system.ravel(order="K")[:: size + 1] += 1
+                factor, failed = zpotrf(system, lower=0, overwrite_a=1)
+                inverse, singular = ztrtri(factor, lower=0, overwrite_c=1)
+                if failed or singular:
+                    raise np.linalg.LinAlgError("fields and variances of the calibration make no finite system.")
+                root[:] = inverse.T
         return found
 
 
