@@ -326,11 +326,11 @@ def columns(fields: CalibrationFields, fraction: float = FAINT, chunk: int = 128
 def _columns(fields: CalibrationFields, fraction: float, chunk: int) -> Columns:
     count, cores = len(fields.points), len(fields.fibrelets.centres)
     inputs = np.vstack([fields.inputs.toarray().conj(), np.zeros(fields.inputs.shape[1])])
-    weighted = (fields.fields / fields.variance).reshape(-1, 2 * cores).T
+    seen, noise = (x.reshape(-1, 2 * cores).T for x in (fields.fields, fields.variance))
     rows, cols, values, variances = [], [], [], []
     for own, chosen, roots in _covariance_roots(fields, fraction, chunk):
         real = chosen < 2 * count
-        right = np.einsum("kjc,kc->kj", inputs[chosen], weighted[own])
+        right = np.einsum("kjc,kc->kj", inputs[chosen], seen[own] / noise[own])
         found = np.einsum("kl,kli->ki", np.einsum("kj,klj->kl", right, roots.conj()), roots)
         rows.append(np.broadcast_to(own[:, None], real.shape)[real])
         cols.append(chosen[real])
