@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fibre import Accelerated, Defocus, GerchbergSaxton, RetrievalStatus, retrieve
+from fibre.retrieval import accelerated
 from fibre.retrieval.base import misfit
 from tests.fibre.test_retrieval import BUNDLE, FRAME, PIXEL, PLANES, errors, stack
 
@@ -25,7 +26,11 @@ def test_the_field_is_found_within_twice_the_photon_limit(photons):
 def test_momentum_lowers_the_misfit_further_than_as_many_averaging_steps(bright):
     data = bright.defocus()
     plain = retrieve(data, GerchbergSaxton(iterations=5, averaging=25, tolerance=0.0, restarts=0, coarsening=1))
+    short = retrieve(data, Accelerated(sweeps=5, iterations=3, tolerance=0.0))
+    compiled = accelerated._run._cache_size()
     fast = retrieve(data, Accelerated(sweeps=5, iterations=25, tolerance=0.0))
+    assert accelerated._run._cache_size() == compiled > 0  # of any number of steps
+    assert np.all(fast.iterations - short.iterations == 22)
     amplitudes = np.sqrt(bright.images).astype(np.float32)
     weights = np.minimum(1, bright.images / 4).astype(np.float32)
     masks = data.masks.astype(np.complex64)

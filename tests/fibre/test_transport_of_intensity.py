@@ -10,6 +10,7 @@ import scipy.fft
 import scipy.ndimage
 
 from fibre import Defocus, Diversity, TransportOfIntensity, angular_spectrum, retrieve
+from fibre.retrieval import transport_of_intensity
 from polinfer import datasets
 
 WAVELENGTH, PIXEL, N = 550e-9, 1e-6, 128
@@ -163,7 +164,9 @@ def test_one_step_is_the_inverse_laplacian_and_right_for_uniform_light():
 def test_refinement_counts_its_steps_and_says_when_it_is_not_done():
     stack = images(UNEVEN * np.exp(1j * PERIODIC))
     assert retrieve(defocus(stack), TransportOfIntensity(iterations=2)).status & 1
+    compiled = transport_of_intensity._solve._cache_size()
     full = retrieve(defocus(stack), TransportOfIntensity())
+    assert transport_of_intensity._solve._cache_size() == compiled > 0  # steps are counted by the same code
     assert full.status == 0
     assert 3 < full.iterations < 40
 
