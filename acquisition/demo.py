@@ -23,7 +23,7 @@ from acquisition.exposure import Bracket
 from acquisition.plan import CalibrationPlan, SamplePlan, Step, Views
 from acquisition.reporting import write_report
 from acquisition.run import calibrate, capture
-from fibre.calibration import clean_fibrelets
+from fibre.coupling import clean_fibrelets
 from fibre.retrieval.base import RetrievalMethod
 from polinfer import ComplexGain, Fit, Measurement, Model, Parameters, RetarderFirst, phantoms
 from polinfer.degeneracy import nearest

@@ -48,7 +48,7 @@ from fibre import (
     staleness,
     update_matrix,
 )
-from fibre.calibration import coupling_profile
+from fibre.coupling import coupling_profile
 from polinfer import datasets, phantoms
 
 WAIST, NOISE, OUTSIDE = 2.5e-6, 0.02, 0.15

@@ -15,7 +15,8 @@ import scipy.optimize
 import scipy.sparse
 import scipy.stats
 
-from fibre.calibration import columns, coupling_profile, response_covariance, usual_response
+from fibre.calibration import columns, response_covariance, usual_response
+from fibre.coupling import coupling_profile
 from fibre.records import CalibrationFields, Inverse
 from fibre.recovery.base import RecoveryMethod, recover
 from fibre.recovery.denoise import basis_pursuit_denoise

@@ -17,8 +17,8 @@ import scipy.spatial
 from tqdm import tqdm
 
 from fibre.amplitudes import CaptureAmplitudes, closure_outside, mean_reference_of
-from fibre.calibration import positions_on_camera
 from fibre.closure import noise_of_groups, noise_scale
+from fibre.coupling import positions_on_camera
 from fibre.drift import Drift, track_drift
 from fibre.fibrelets import LocalPower, ModeBasis, lattice_pitch, locate_fibrelets, mode_matrix
 from fibre.interference import relative_phase

@@ -21,7 +21,7 @@ import scipy.spatial
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from fibre.calibration import positions_on_camera, spot_spacing
+from fibre.coupling import positions_on_camera, spot_spacing
 from fibre.records import Calibration, CalibrationFields, Inverse
 from polinfer.checks import one_of_types
 from polinfer.cluster import spread

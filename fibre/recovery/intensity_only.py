@@ -18,7 +18,7 @@ import scipy.spatial
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from fibre.calibration import Profile, positions_on_camera, profile_of_patterns
+from fibre.coupling import Profile, positions_on_camera, profile_of_patterns
 from fibre.fibrelets import lattice_pitch, mode_matrix, reference_region
 from fibre.fields import fibrelets_of, pattern_groups, retrieve_fields
 from fibre.records import Calibration, CalibrationFields, Fibrelets, Images, Inverse

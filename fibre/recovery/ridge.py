@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from fibre.calibration import clean_fibrelets, lit_points
+from fibre.coupling import clean_fibrelets, lit_points
 from fibre.records import CalibrationFields
 from fibre.recovery.base import RowByRow
 from polinfer.checks import real_number

@@ -8,7 +8,7 @@ import scipy.sparse
 import scipy.stats
 
 from fibre import ForwardInverse, Inverse, Ridge, basis_pursuit_denoise, recover, refresh, staleness, update_matrix
-from fibre.calibration import clean_fibrelets
+from fibre.coupling import clean_fibrelets
 from polinfer import datasets
 from tests.fibre.scenes import WAIST, complex_noise
 from tests.fibre.test_recovery import error, held_out

@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fibre.calibration import (
-    clean_fibrelets,
-    columns,
-    coupling_profile,
-    positions_on_camera,
-    response_covariance,
-    unmeasured,
-)
+from fibre.calibration import columns, response_covariance, unmeasured
+from fibre.coupling import clean_fibrelets, coupling_profile, positions_on_camera
 from tests.fibre.scenes import complex_noise, scene, without_noise
 
 NOISE = 0.01

@@ -15,7 +15,7 @@ from fibre import (
     recover,
     rows_from_intensities,
 )
-from fibre.calibration import coupling_profile
+from fibre.coupling import coupling_profile
 from tests.fibre import benches
 from tests.fibre.scenes import complex_noise
 

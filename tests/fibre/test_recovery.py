@@ -19,7 +19,8 @@ from fibre import (
     recover,
     retrieve_fields,
 )
-from fibre.calibration import clean_fibrelets, columns
+from fibre.calibration import columns
+from fibre.coupling import clean_fibrelets
 from tests.fibre.benches import METHOD
 from tests.fibre.scenes import complex_noise, scene
 
