@@ -45,8 +45,9 @@ class Modal(ModeMethod):
     neighbours' phases, in which errors are large that reach far. Where no image is that local (masks that spread
     light, large defocus), a few sweeps of :class:`fibre.GerchbergSaxton` make the start.
 
-    All is computed on a grid of half a mode radius, with images filtered to its band limit. Light that no mode carries
-    is a misfit.
+    All is computed on a grid of half a mode radius, with images filtered to its band limit. That leaves an error of
+    0.4 % in the field; a coarser one (``coarsening``) is faster: 0.6 radii take two thirds of the pixels and leave 1 %,
+    0.7 radii half of them and 5 %. Light that no mode carries is a misfit.
 
     Parameters
     ----------
@@ -54,7 +55,8 @@ class Modal(ModeMethod):
     each, >= 1. tolerance: relative change of the amplitudes at which the steps end, >= 0. focus_spread: metres,
     standard deviation of a common error of all distances, found with the field; 0: none, and needed where masks are
     not those of a defocus. gain_spread: the same for the brightness of each image, relative to 1. coarsening: camera
-    pixels in a pixel of the grid, None: as the modes allow.
+    pixels in a pixel of the grid, >= 1, whole or not, where it divides the frame into even numbers; None: as many as
+    make half a mode radius.
 
     Raises
     ------
@@ -82,7 +84,7 @@ class Modal(ModeMethod):
     tolerance: float = 2e-3
     focus_spread: float = 0.0
     gain_spread: float = 0.0
-    coarsening: int | None = None
+    coarsening: float | None = None
 
     def __post_init__(self) -> None:
         one_of_types("fibrelets", self.fibrelets, (Fibrelets,), "pass Fibrelets(centres, mode_radius).")
@@ -92,7 +94,7 @@ class Modal(ModeMethod):
         real_number("focus_spread", self.focus_spread, low=0)
         real_number("gain_spread", self.gain_spread, low=0)
         if self.coarsening is not None:
-            integer("coarsening", self.coarsening, low=1)
+            real_number("coarsening", self.coarsening, low=1)
 
     def solve(self, stack: Stack) -> Solution:
         """See :meth:`RetrievalMethod.solve`."""
@@ -272,7 +274,7 @@ def _read(images: Images, capture: int) -> tuple[np.ndarray, np.ndarray]:
     return radiance, noise
 
 
-def _coarse(stack: Stack, k: int, step: int) -> tuple[np.ndarray, np.ndarray]:
+def _coarse(stack: Stack, k: int, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Images of field ``k`` and their variances on the coarse grid, (image, y, x)."""
     intensities = stack.intensities[k]
     variance = _variance(intensities) if stack.variance is None else stack.variance[k]

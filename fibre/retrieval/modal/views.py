@@ -25,14 +25,14 @@ class Views:
     """The map from amplitudes c (m,) to fields (image, y, x), all of one size, in units of a camera pixel's field.
 
     modes: sparse float32 (y x, m), its transpose beside it, masks complex64 (image, y, x), pixel_size: of the coarse
-    grid, metres, step: camera pixels in one of its pixels along an axis.
+    grid, metres, step: camera pixels in one of its pixels along an axis, which need not be whole.
     """
 
     modes: scipy.sparse.csr_array
     transposed: scipy.sparse.csr_array
     masks: np.ndarray
     pixel_size: float
-    step: int
+    step: float
 
     @cached_property
     def squares(self) -> scipy.sparse.csr_array:
@@ -86,20 +86,22 @@ def squared(field: np.ndarray) -> np.ndarray:
     return np.asarray(power)
 
 
-def make_views(fibrelets: Fibrelets, masks: np.ndarray, pixel_size: float, coarsening: int | None) -> Views:
+def make_views(fibrelets: Fibrelets, masks: np.ndarray, pixel_size: float, coarsening: float | None) -> Views:
     """The map for images through ``masks`` (image, y, x).
 
-    A grid of ``coarsening`` camera pixels; None: the coarsest that divides the frame and whose pixels are at most half
-    a mode radius wide. There a Gaussian mode's spectrum has fallen to 0.1 % at the edge, and its intensity's to 1 %.
+    A grid of ``coarsening`` camera pixels; None: of the largest whole number of them that divides the frame and makes
+    pixels at most half a mode radius wide. There a Gaussian mode's spectrum has fallen to 0.1 % at the edge, and its
+    intensity's to 1 %.
     """
     shape = masks.shape[-2:]
     if coarsening is None:
         wanted = int(0.5 * float(np.median(fibrelets.mode_radius)) / pixel_size)
         coarsening = next(n for n in range(max(wanted, 1), 0, -1) if n == 1 or not any(s % (2 * n) for s in shape))
-    if coarsening > 1 and any(s % (2 * coarsening) for s in shape):
-        raise ValueError(f"coarsening is {coarsening}, but the frame {shape} is no multiple of {2 * coarsening}; "
-                         "take None.")  # fmt: skip
-    few = tuple(s // coarsening for s in shape)
+    few = _few(shape, coarsening)
+    uneven = [n % 2 or abs(n * coarsening - s) > 1e-6 * s for n, s in zip(few, shape, strict=True)]
+    if coarsening > 1 and any(uneven):
+        raise ValueError(f"coarsening is {coarsening}, which does not divide the frame {shape} into even numbers of "
+                         "pixels; take None, or the side of the frame over an even number.")  # fmt: skip
     rows, columns = (_low(s, n) for s, n in zip(shape, few, strict=True))
     modes = scipy.sparse.csr_array(mode_matrix(fibrelets, few, pixel_size * coarsening) / coarsening).astype(np.float32)
     # short indices: half of what a product has to read
@@ -108,17 +110,21 @@ def make_views(fibrelets: Fibrelets, masks: np.ndarray, pixel_size: float, coars
     return Views(modes, modes.T.tocsr(), low, pixel_size * coarsening, coarsening)
 
 
+def _few(shape: tuple[int, ...], step: float) -> tuple[int, int]:
+    """The coarse grid's shape for images (..., y, x)."""
+    return round(shape[-2] / step), round(shape[-1] / step)
+
+
 def _low(count: int, few: int) -> np.ndarray:
     """Places of the ``few`` lowest frequencies of ``count``."""
     return np.r_[0 : few // 2, count - (few - few // 2) : count]
 
 
-def coarse_images(images: np.ndarray, step: int) -> np.ndarray:
+def coarse_images(images: np.ndarray, step: float) -> np.ndarray:
     """Band-limited samples of images (image, y, x), each the mean over a coarse pixel's place, float32."""
     if step == 1:
         return images
-    shape = images.shape[-2:]
-    few = tuple(s // step for s in shape)
+    shape, few = images.shape[-2:], _few(images.shape, step)
     rows, columns = (_low(s, n) for s, n in zip(shape, few, strict=True))
     # the middle of a coarse pixel lies between camera pixels
     shift = [np.exp(2j * np.pi * np.fft.fftfreq(s)[low] * (step - 1) / 2).astype(np.complex64)
@@ -133,18 +139,26 @@ def coarse_images(images: np.ndarray, step: int) -> np.ndarray:
     return coarse
 
 
-def coarse_variance(variance: np.ndarray, step: int) -> np.ndarray:
-    """Variance of :func:`coarse_images` from that of the camera's pixels, infinite where one is unusable."""
+def coarse_variance(variance: np.ndarray, step: float) -> np.ndarray:
+    """Variance of :func:`coarse_images` from that of the camera's pixels, infinite where one is unusable.
+
+    Of ``step``^2 pixels one is left, and so much less noise: the mean variance over a coarse pixel's place, to which a
+    camera pixel counts with the share that lies there, over ``step``^2.
+    """
     if step == 1:
         return variance
-    # rows first, which are contiguous: a mean over two axes of a five-dimensional view takes six times as long
-    coarse = np.empty((len(variance), *(s // step for s in variance.shape[1:])), np.float32)
+    few = _few(variance.shape, step)
+    down, across = (_shares(s, n) / np.float32(step) for s, n in zip(variance.shape[1:], few, strict=True))
+    coarse = np.empty((len(variance), *few), np.float32)
     for image, out in zip(variance, coarse, strict=True):
-        rows = image[0::step] + image[1::step]
-        for i in range(2, step):
-            rows += image[i::step]
-        np.add(rows[:, 0::step], rows[:, 1::step], out=out)
-        for j in range(2, step):
-            out += rows[:, j::step]
-        out /= step**4
+        # a sparse product has no share of nothing, which an infinite variance would make NaN
+        out[...] = (across @ np.ascontiguousarray((down @ image).T)).T
     return coarse
+
+
+def _shares(count: int, few: int) -> scipy.sparse.csr_array:
+    """The mean over each of ``few`` equal parts of an axis of ``count`` pixels, sparse float32 (few, count)."""
+    # all edges, in units of 1 / (few count) of the axis, so that they are whole
+    edges = np.union1d(np.arange(few) * count, np.arange(count) * few)
+    widths = np.diff(np.r_[edges, few * count]) / count
+    return scipy.sparse.csr_array((widths.astype(np.float32), (edges // count, edges // few)), shape=(few, count))
