@@ -23,6 +23,7 @@ from fibre.records import CalibrationFields
 __all__ = [
     "Columns",
     "columns",
+    "fibrelets_a_point",
     "response_covariance",
     "unmeasured",
     "usual_response",
@@ -101,6 +102,17 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         yield _Regressions(cores, chosen, root, scaled, weight)
 
 
+def fibrelets_a_point(fields: CalibrationFields) -> float:
+    """How many fibrelets there are to a calibrated point, >= 1: as many as a circle as large as its square cell holds,
+    on average."""
+    positions = positions_on_camera(fields)
+    if len(positions) < 2:
+        return 1.0
+    tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
+    around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
+    return max(float(around.mean()), 1.0)
+
+
 def unmeasured(fields: CalibrationFields) -> np.ndarray:
     r"""Power on each fibrelet, (m,), of light that enters where no spot was, in proportion to an even light's.
 
@@ -112,13 +124,10 @@ def unmeasured(fields: CalibrationFields) -> np.ndarray:
     over all fibrelets l, with the :func:`coupling_profile`: an even light is the sum of spots at all points, and
     its amplitude on a fibrelet falls as the points' density, 1/n. 0 where points are as dense as fibrelets.
     """
-    centres, positions = fields.fibrelets.centres, positions_on_camera(fields)
-    if len(positions) < 2:
+    centres, count = fields.fibrelets.centres, fibrelets_a_point(fields)
+    if count == 1:
         return np.zeros(len(centres))
     tree, profile = scipy.spatial.cKDTree(centres), coupling_profile(fields)
-    # circles as large as the square cell of a point
-    around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
-    count = max(float(around.mean()), 1.0)
     share = (1 - 1 / count) / count**2
     pairs = tree.sparse_distance_matrix(tree, profile.reach(FAINT), output_type="coo_matrix")
     return share * np.bincount(pairs.row, profile(pairs.data), len(centres))

@@ -9,12 +9,16 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from fibre.calibration import columns, response_covariance
+from fibre.calibration import columns, fibrelets_a_point, response_covariance
 from fibre.records import Inverse, RecordingFields
 from polinfer import Measurement
 from polinfer.checks import one_of_types
 
 __all__ = ["reconstruct"]
+
+SECOND_MOMENT = (
+    1 / 6
+)  # of what a point sees of the sample around it, in pitches squared: a triangle from one to the next
 
 
 def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurement:
@@ -34,8 +38,14 @@ def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurem
     they do to J, :math:`\sigma^2 = \tfrac14 \sum_p \sum_{st} E[e_{ps} e_{pt}^*] (U^+ U)_{st}`: the sigma of
     independent errors with the same :math:`E\,\mathrm{tr}[\delta J U U^H \delta J^H]`, the error as the likelihood
     weighs it. H and V differ in noise, and so do the states; one sigma does not say so. To this is added, in the same
-    way, what the regularisation mixes in from neighbours that differ, estimated by sending the estimates through
-    :math:`A^{-1} \hat A` once more.
+    way, what is mixed in from places that differ. Of other points, by the regularisation: seen by sending the estimates
+    through :math:`A^{-1} \hat A` once more. And of the sample between the points, where there are n > 1 fibrelets to a
+    point: what a point sees of its surroundings falls to nothing at the next one, a triangle, whose second moment is a
+    sixth of the pitch squared, so
+
+    .. math:: \delta J = \left(1 - \frac1n\right) \frac{1}{12} \left( \Delta_y^2 J + \Delta_x^2 J \right)
+
+    with the second differences over the grid, less what the noise of J puts into their squares.
 
     Raises
     ------
@@ -93,4 +103,23 @@ def _variance(inverse: Inverse, fields: RecordingFields, response: np.ndarray, i
     again = (inverse.matrix @ (known @ distal)).reshape(2, count, 2 * states).swapaxes(0, 1)
     blur = again[..., :states] - jones @ again[..., states:]
     total += np.einsum("ips,ist,ipt->i", blur, projector, blur.conj()).real
-    return np.maximum(total, 0) / 4
+    total = np.maximum(total, 0)
+    between = (1 - 1 / fibrelets_a_point(inverse.calibration)) * SECOND_MOMENT / 2
+    return (total + between**2 * _curvature(jones, illumination, total, inverse.calibration.grid)) / 4
+
+
+def _curvature(jones: np.ndarray, illumination: np.ndarray, noise: np.ndarray, grid: tuple[int, int]) -> np.ndarray:
+    """Squared second differences of J (p, 2, 2) over the grid, sum over both axes, as the light weighs them, (p,);
+    less their expectation where the ``noise`` of J, weighed alike, is all there is. Edges have their neighbour's."""
+    light = np.maximum((np.abs(illumination) ** 2).sum((1, 2)), 1e-300)
+    field, relative = jones.reshape(*grid, 2, 2), (noise / light).reshape(grid)
+    bend, expected = np.zeros_like(field), np.zeros(grid)
+    for axis in range(2):
+        if grid[axis] < 3:
+            continue
+        inside = np.clip(np.arange(grid[axis]), 1, grid[axis] - 2)
+        for away, weight in ((-1, 1), (0, -2), (1, 1)):
+            bend += weight * field.take(inside + away, axis)
+            expected += weight**2 * relative.take(inside + away, axis)
+    change = bend.reshape(-1, 2, 2) @ illumination
+    return np.maximum((np.abs(change) ** 2).sum((1, 2)) - expected.ravel() * light, 0)

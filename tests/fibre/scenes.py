@@ -59,6 +59,21 @@ class Scene:
             fibrelets=Fibrelets(self.bundle.centres, 1.6e-6), illumination=states,
         )  # fmt: skip
 
+    def recording_between(self, jones_at, noise):
+        """As :meth:`recording`, of light that is everywhere and not at the points alone; the sample's Jones matrices
+        are ``jones_at`` places (q, 2). No noise is added."""
+        pitch, (rows, columns) = self.plan.pitch, self.plan.grid
+        y, x = (np.arange(-n - 2, n + 3) * pitch / 2 for n in (rows, columns))
+        places = np.stack(np.meshgrid(y, x, indexing="ij"), -1).reshape(-1, 2)
+        launch = self.bundle.launch(places, WAIST) / 4
+        matrix = self.bundle.columns(scipy.sparse.block_diag([launch, launch])).toarray()
+        everywhere = replace(self, plan=replace(self.plan, grid=(2 * rows + 5, 2 * columns + 5), pitch=pitch / 2),
+                             matrix=matrix)  # fmt: skip
+        assert np.allclose(everywhere.plan.points, places)
+        found = everywhere.recording(jones_at(places), everywhere.light(), 0.0, 0)
+        variance = np.full(found.fields.shape, noise**2)
+        return replace(found, variance=variance, blank_variance=variance)
+
     def light(self, amplitude=0.5):
         """A broad beam over the points, (p,)."""
         return amplitude * np.exp(-(self.plan.points**2).sum(1) / 40e-6**2)

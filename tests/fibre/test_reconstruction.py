@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from fibre import Fibrelets, ForwardInverse, reconstruct, recover
+from polinfer import Parameters
+from tests.fibre.scenes import scene
+from tests.oracles import jones as oracle
 
 NOISE = 0.003
 
@@ -112,6 +115,60 @@ def test_more_noise_in_the_recording_is_a_larger_sigma(standard, inverse):
     assert np.median(sigmas[0]) < np.median(sigmas[1]) < np.median(sigmas[2])
     ratio = np.median(sigmas[2] / reconstruct(inverse, standard.recording(jones, light, 3e-2, 2)).sigma)
     assert ratio == pytest.approx(1 / 3, rel=0.15)  # where the recording's noise dominates
+
+
+def waves(period):
+    """Jones matrices at places (q, 2) that repeat themselves after ``period`` metres."""
+
+    def at(places):
+        y, x = (2 * np.pi * places / period).T
+        values = Parameters(
+            0.3 + 0.1 * np.sin(y + x),
+            0.5 + 0.1 * np.cos(x),
+            1.2 + 0.2 * np.sin(x),
+            0.4 + 0.1 * np.cos(y),
+            0.1 * np.sin(y),
+        )
+        return np.array([oracle.jones(point) for point in np.stack(values, 1)])
+
+    return at
+
+
+@pytest.fixture(scope="module")
+def sparse():
+    """A scene of three fibrelets to a point, and its inverse, whose calibration has next to no noise."""
+    few = scene(grid=(9, 9), radius=45e-6, reference=(0.0, 41e-6), pitch=7.6e-6)
+    return few, recover(few.calibration(1e-3, 0), ForwardInverse())
+
+
+@pytest.mark.parametrize("period", [30e-6, 45e-6, 60e-6])
+def test_what_lies_between_the_points_is_in_sigma(sparse, period):
+    few, inverse = sparse
+    measurement = reconstruct(inverse, few.recording_between(waves(period), 1e-6))
+    inside = np.zeros(few.plan.grid, bool)
+    inside[1:-1, 1:-1] = True
+    squared = weighted_error(measurement, waves(period)(few.plan.points))[inside.ravel()]
+    stated = measurement.sigma[inside] ** 2
+    assert 0.6 < squared.mean() / stated.mean() < 1.7
+    assert 0.6 < np.median(squared / stated) < 1.7
+
+
+def test_where_the_sample_is_even_nothing_is_stated_for_light_between_the_points(sparse):
+    few, inverse = sparse
+    even, uneven = (
+        reconstruct(inverse, few.recording_between(waves(period), 1e-6)).sigma[1:-1, 1:-1] for period in (1.0, 45e-6)
+    )
+    assert np.median(even / uneven) < 0.5
+
+
+def test_noise_is_not_taken_for_a_sample_that_changes_between_the_points(sparse, monkeypatch):
+    few, inverse = sparse
+    even = np.broadcast_to(np.eye(2), (81, 2, 2))
+    fields = few.recording(even, few.light(), 0.01, 0)
+    sigma = reconstruct(inverse, fields).sigma
+    monkeypatch.setattr("fibre.reconstruction.SECOND_MOMENT", 0.0)
+    without = reconstruct(inverse, fields).sigma
+    assert 1 <= np.mean((sigma / without) ** 2) < 1.05
 
 
 def test_other_fibrelets_and_other_records_are_refused(standard, inverse):
