@@ -15,6 +15,10 @@ from benchmarks.results import keep
 QUICK: dict[str, dict[str, int]] = {
     "accuracy": {},
     "retrieval": {"size": 240},
+    "recovery": {"size": 8},
+    "ordering": {"size": 4},
+    "posterior": {},
+    "misalignment": {"size": 2},
     "texture": {},
     "stored": {},
     "streaming": {},
@@ -65,7 +69,7 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown benchmark {unknown[0]!r}; there are {', '.join(ALL)}")
     jax.config.update("jax_enable_x64", True)
-    options = {"size": given.size, "full": given.full}
+    options = {"size": given.size, "full": given.full, "quick": not given.names and not given.full}
     for name in given.names or QUICK:
         function = importlib.import_module(f"benchmarks.{name}").main
         own = {} if given.names else QUICK[name]

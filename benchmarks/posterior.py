@@ -44,10 +44,10 @@ AGREEMENT = ((0.05, None), (0.4, None), (0.4, ComplexGain(1.0)))
 SPREAD_D = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9, 0.97, 0.999])
 
 
-def speed(results: Results, pixels: int) -> None:
+def speed(results: Results, pixels: int, sigmas: tuple[float, ...] = SIGMAS) -> None:
     """Time of a frame, and the least effective number of draws of its pixels."""
     states = scenes.balanced_states()
-    for (gain, (kind, bar)), sigma in ((g, s) for g in GAINS.items() for s in SIGMAS):
+    for (gain, (kind, bar)), sigma in ((g, s) for g in GAINS.items() for s in sigmas):
         model = Model(gain=kind)
         truth = scenes.from_priors(model, pixels, np.random.default_rng(1))
         for dtype in ("complex64", "complex128"):
@@ -171,9 +171,13 @@ def agreement(results: Results, pixels: int) -> None:
                 at_least=True)  # fmt: skip
 
 
-def main(size: int | None = None, full: bool = False) -> None:
-    """Print the tables."""
+def main(size: int | None = None, full: bool = False, quick: bool = False) -> None:
+    """Print the tables. ``quick``: time and effective draws of a frame at one noise."""
     results = Results("posterior")
+    if quick:
+        speed(results, size or PIXELS, (0.02,))
+        results.save()
+        return
     speed(results, size or PIXELS)
     noise_unknown(results, size or PIXELS)
     stream(results, 65536 if full else 16384)

@@ -371,10 +371,14 @@ def pressed(results: Results) -> None:
             results.bar(f"{name}, {count} probes: error over the better of old and fresh", off[2] / min(off[:2]), 1.0)
 
 
-def main(size: int | None = None, full: bool = False) -> None:
-    """Print the tables; ``size``: points along each axis instead of 27 x 36."""
+def main(size: int | None = None, full: bool = False, quick: bool = False) -> None:
+    """Print the tables; ``size``: points along each axis instead of 27 x 36. ``quick``: methods and solvers only."""
     results = Results("recovery")
     methods(results, size, full)
+    if quick:
+        solvers(results)
+        results.save()
+        return
     if full:
         retrieved(results, size)
     solvers(results)

@@ -26,6 +26,7 @@ from polinfer.checks import integer, one_of_types, real_number
 
 __all__ = ["Modal"]
 
+LARGE = 1 << 18  # pixels of a frame, from which on two threads make one FFT faster
 MOST = 20  # Gerchberg-Saxton sweeps where no image is local
 
 
@@ -102,7 +103,7 @@ class Modal(ModeMethod):
         count, cores = len(stack.intensities), os.cpu_count() or 1
 
         def one(k: int) -> tuple[Found, bool]:
-            with scipy.fft.set_workers(max(1, cores // count)):
+            with scipy.fft.set_workers(_workers(count, stack)):
                 images, spread = _coarse(stack, k, geometry.views.step)
                 found = self._found(stack, k, geometry, images, spread)
                 misfitted = stack.variance is not None and _judged(found, images, spread)[1]
@@ -124,9 +125,9 @@ class Modal(ModeMethod):
         cores = os.cpu_count() or 1
 
         def one(radiance: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
-            with scipy.fft.set_workers(max(1, cores // len(captures))):
-                stack = Stack(radiance[None, :planes], noise[None, :planes], masks, distances, images.wavelength,
-                              images.pixel_size)  # fmt: skip
+            stack = Stack(radiance[None, :planes], noise[None, :planes], masks, distances, images.wavelength,
+                          images.pixel_size)  # fmt: skip
+            with scipy.fft.set_workers(_workers(len(captures), stack)):
                 geometry = _geometry(self, stack)
                 coarse, spread = _coarse(stack, 0, geometry.views.step)
                 found = self._found(stack, 0, geometry, coarse, spread)
@@ -216,6 +217,11 @@ class _Key:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Key) and self.values == other.values
+
+
+def _workers(fields: int, stack: Stack) -> int:
+    """Threads for one FFT while so many fields are found side by side: in small ones they wait for each other."""
+    return max(1, (os.cpu_count() or 1) // fields) if np.prod(stack.masks.shape[-2:]) >= LARGE else 1
 
 
 def _geometry(method: Modal, stack: Stack) -> Geometry:

@@ -7,7 +7,7 @@ the same coarse grid. Called by the start and by the Gauss-Newton steps of :clas
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -156,6 +156,7 @@ def coarse_variance(variance: np.ndarray, step: float) -> np.ndarray:
     return coarse
 
 
+@lru_cache(maxsize=8)
 def _shares(count: int, few: int) -> scipy.sparse.csr_array:
     """The mean over each of ``few`` equal parts of an axis of ``count`` pixels, sparse float32 (few, count)."""
     # all edges, in units of 1 / (few count) of the axis, so that they are whole
