@@ -62,6 +62,9 @@ def main() -> None:
     parser.add_argument("--size", type=int, help="pixels, instead of each script's own number")
     parser.add_argument("--full", action="store_true", help="all pixels and cases; up to an hour a script")
     parser.add_argument(
+        "--quick", action="store_true", help="the first questions only of those that have many; without names always"
+    )
+    parser.add_argument(
         "--page", action="store_true", help="then rewrite docs/results.md, with ratios to the figures it had"
     )
     given = parser.parse_args()
@@ -69,7 +72,8 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown benchmark {unknown[0]!r}; there are {', '.join(ALL)}")
     jax.config.update("jax_enable_x64", True)
-    options = {"size": given.size, "full": given.full, "quick": not given.names and not given.full}
+    quick = given.quick or not (given.names or given.full)
+    options = {"size": given.size, "full": given.full, "quick": quick}
     for name in given.names or QUICK:
         function = importlib.import_module(f"benchmarks.{name}").main
         own = {} if given.names else QUICK[name]
@@ -78,6 +82,7 @@ def main() -> None:
         if given.page:
             size = own.get("size", given.size)
             arguments = ("" if size is None else f" --size {size}") + (" --full" if given.full else "")
+            arguments += " --quick" if quick and "quick" in takes else ""
             print(f"wrote {keep([name], arguments)}")
 
 

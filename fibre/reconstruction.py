@@ -16,9 +16,8 @@ from polinfer.checks import one_of_types
 
 __all__ = ["reconstruct"]
 
-SECOND_MOMENT = (
-    1 / 6
-)  # of what a point sees of the sample around it, in pitches squared: a triangle from one to the next
+# of what a point sees of the sample around it, in pitches squared: a triangle from one point to the next
+SECOND_MOMENT = 1 / 6
 
 
 def reconstruct(inverse: Inverse, recording_fields: RecordingFields) -> Measurement:
