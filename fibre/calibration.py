@@ -16,14 +16,20 @@ from scipy.linalg.blas import zherk
 from scipy.linalg.lapack import zpotrf, ztrtri
 from threadpoolctl import threadpool_limits
 
-from fibre.coupling import clean_fibrelets, coupling_profile, lit_points, made, once, positions_on_camera
-from fibre.fibrelets import lattice_pitch
+from fibre.coupling import (
+    clean_fibrelets,
+    coupling_profile,
+    fibrelets_a_point,
+    lit_points,
+    made,
+    once,
+    positions_on_camera,
+)
 from fibre.records import CalibrationFields
 
 __all__ = [
     "Columns",
     "columns",
-    "fibrelets_a_point",
     "response_covariance",
     "unmeasured",
     "usual_response",
@@ -100,17 +106,6 @@ def _regressions(fields: CalibrationFields, fraction: float, chunk: int) -> Iter
         scaled = root[..., None] * inputs[chosen]
         weight = 1 / fields.variance[:, :, cores].transpose(1, 2, 0)
         yield _Regressions(cores, chosen, root, scaled, weight)
-
-
-def fibrelets_a_point(fields: CalibrationFields) -> float:
-    """How many fibrelets there are to a calibrated point, >= 1: as many as a circle as large as its square cell holds,
-    on average."""
-    positions = positions_on_camera(fields)
-    if len(positions) < 2:
-        return 1.0
-    tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
-    around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
-    return max(float(around.mean()), 1.0)
 
 
 def unmeasured(fields: CalibrationFields) -> np.ndarray:

@@ -24,6 +24,7 @@ __all__ = [
     "Profile",
     "clean_fibrelets",
     "coupling_profile",
+    "fibrelets_a_point",
     "lit_points",
     "made",
     "once",
@@ -101,6 +102,21 @@ def lit_points(fields: CalibrationFields) -> list[np.ndarray]:
 def positions_on_camera(fields: CalibrationFields | Calibration) -> np.ndarray:
     """The distal points on the camera, (p, 2) metres, by the registration."""
     return fields.points @ fields.registration[:, :2].T + fields.registration[:, 2]
+
+
+def fibrelets_a_point(fields: CalibrationFields) -> float:
+    """How many fibrelets there are to a calibrated point, >= 1: as many as a circle as large as its square cell holds,
+    on average. Made once for a calibration."""
+    return float(once(fields, "fibrelets a point", lambda: _fibrelets_a_point(fields)))
+
+
+def _fibrelets_a_point(fields: CalibrationFields) -> float:
+    positions = positions_on_camera(fields)
+    if len(positions) < 2:
+        return 1.0
+    tree = scipy.spatial.cKDTree(fields.fibrelets.centres)
+    around = tree.query_ball_point(positions, lattice_pitch(positions) / np.sqrt(np.pi), return_length=True)
+    return max(float(around.mean()), 1.0)
 
 
 def clean_fibrelets(fields: CalibrationFields) -> np.ndarray:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse
 
-from fibre.calibration import columns, fibrelets_a_point, response_covariance
+from fibre.calibration import columns, response_covariance
+from fibre.coupling import fibrelets_a_point
 from fibre.records import Inverse, RecordingFields
 from polinfer import Measurement
 from polinfer.checks import one_of_types
