@@ -52,10 +52,12 @@ class SimulatedBench:
             f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in ("bundle", "phantom", "camera")
         }
         settings |= {name: asdict(settings[name]) for name in ("hologram", "lens") if settings[name] is not None}
-        bundle, coupling = self.scene.bundle, self.scene.bundle.coupling
+        bundle, coupling, phantom = self.scene.bundle, self.scene.bundle.coupling, self.scene.phantom
         digest = hashlib.sha256()
+        # the parameters and not the Jones matrices, whose last digits are the compiler's
         for part in (
-            self._sample[0],
+            *phantom.parameters,
+            1.0 if phantom.gain is None else phantom.gain,
             bundle.centres,
             bundle.mode_radius,
             bundle.distal_centres,
@@ -105,7 +107,7 @@ class SimulatedBench:
                 raise ValueError("points must be given for a step that lights spots.")
             launched += (scene.bundle.launch(points, scene.spot_waist) @ self._spots(step, state, points).T).T
         elif step.kind in ("blank", "sample"):
-            places, light, jones, waist = self._sample[1:]
+            places, light, jones, waist = self._sample
             field = self._arms(state, places)
             if step.kind == "sample":
                 field = np.einsum("kij,jk->ik", jones, field)
@@ -148,8 +150,8 @@ class SimulatedBench:
             light = shown_spots(scene.hologram, points, light, scene.pitch, self.wavelength, scene.image_time)
         return light * self._arms(np.ones(2), points)
 
-    def _sample_field(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Jones matrices on the grid, and places, light, Jones matrices and spot size of the finer sample."""
+    def _sample_field(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """Places, light, Jones matrices and spot size of the sample, which is finer than the grid if the scene says."""
         scene = self.scene
         parameters, gain = scene.phantom.parameters, scene.phantom.gain
         jones = jones_on_host(RetarderFirst(), parameters)
@@ -171,7 +173,7 @@ class SimulatedBench:
         # a lattice of unit-power Gaussians of waist w and spacing h adds up to a flat field in proportion to w / h^2
         share = (scene.spot_waist / waist) / fine**2
         light = scene.illumination * share * np.exp(-(places**2).sum(1) / scene.illumination_waist**2)
-        return jones, places, light, finer, waist
+        return places, light, finer, waist
 
     def _views(self, amplitudes: np.ndarray, views: Views, step: Step) -> np.ndarray:
         """Photo-electrons per second of every view, real (image, y, x)."""

@@ -20,7 +20,8 @@ Algorithm = Literal["variational", "message_passing", "spectral"]
 
 CHUNK = 32  # rows at a time
 STAGE = 20  # iterations, at most, at one level of noise
-POLISH = 3  # Gauss-Newton steps at the end
+SETTLED = 1e-3  # relative change of a row by an iteration below which the rest is left to Gauss-Newton steps
+POLISH = 12  # of these, at most
 FAINT = 1e-12  # of the prior's variance: nothing
 COOL = 0.6  # factor of the noise from stage to stage, at least
 DAMPING = (0.3, 0.15)  # share of the new message, from try to try
@@ -170,7 +171,7 @@ class _Problem(NamedTuple):
 
     def backward(self, fields: np.ndarray) -> np.ndarray:
         """Adjoint: (k, n) of (k, c)."""
-        return (self.x.conj().swapaxes(1, 2) @ fields[..., None])[..., 0]
+        return (self.x.swapaxes(1, 2) @ fields.conj()[..., None])[..., 0].conj()
 
     def some(self, rows: np.ndarray) -> _Problem:
         """Some of the rows."""
@@ -265,10 +266,10 @@ class _Problem(NamedTuple):
                 rows = (inverse @ self.backward(weight * mean * z / np.maximum(size, 1e-300))[..., None])[..., 0]
                 change = np.linalg.norm(rows - before, axis=1) / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
                 spent += 1
-                if np.all(change < (1e-6 if last else 1e-2)):
+                if np.all(change < (SETTLED if last else 1e-2)):
                     break
             if last:
-                return self.polished(rows, change > 1e-3)
+                return self.polished(rows, change > SETTLED)
             extra = np.minimum(COOL * extra, self.misfit(rows))
             extra = np.where((extra < 0.1 * typical) | (spent > 0.7 * iterations), 0, extra)
 
@@ -285,7 +286,7 @@ class _Problem(NamedTuple):
             left = self.intensity - np.abs(self.forward(rows)) ** 2
             return np.asarray((weight * left**2).sum(1) + 2 * (np.abs(rows) ** 2).sum(1))
 
-        now = cost(rows)
+        now, moves = cost(rows), True
         for number in range(POLISH + 1):
             z = self.forward(rows)
             slope = z.conj()[..., None] * self.x
@@ -297,7 +298,7 @@ class _Problem(NamedTuple):
             stiff = np.einsum("kii->ki", system).max(1)[:, None, None]
             system = system + stiff * around[:, :, None] * around[:, None, :]
             covariance = np.linalg.inv(system)
-            if number == POLISH:
+            if number == POLISH or not moves:
                 break
             left = weight * (self.intensity - np.abs(z) ** 2)
             gradient = (slope.swapaxes(1, 2) @ left[..., None])[..., 0] - 2 * both
@@ -305,6 +306,7 @@ class _Problem(NamedTuple):
             new = rows + step[:, :n] + 1j * step[:, n:]
             then = cost(new)
             better = then < now
+            moves = bool(np.any(better & (np.linalg.norm(step, axis=1) > 1e-9 * np.linalg.norm(both, axis=1))))
             rows, now = np.where(better[:, None], new, rows), np.where(better, then, now)
         spread = np.einsum("kii->ki", covariance)
         variance = np.maximum(spread[:, :n] + spread[:, n:], 0)

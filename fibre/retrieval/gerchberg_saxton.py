@@ -167,11 +167,13 @@ def _solve(
     unseen = 1 - jnp.abs(masks) ** 2
     usable = (weights > 0).astype(weights.dtype)
 
+    # one view after the other, in a loop that is compiled once: quicker than all at once, or than a row of them
+    def visit(i: Any, spectrum: jax.Array) -> jax.Array:
+        view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], usable[:, i])
+        return jnp.fft.fft2(view) * back[i] + spectrum * unseen[i]
+
     def sweep(spectrum: jax.Array) -> jax.Array:
-        for i in range(images):
-            view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], usable[:, i])
-            spectrum = jnp.fft.fft2(view) * back[i] + spectrum * unseen[i]
-        return spectrum
+        return jax.lax.fori_loop(0, images, visit, spectrum)
 
     def step(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         spectrum, change, count = carry
@@ -185,9 +187,11 @@ def _solve(
         return jnp.any((carry[2] < iterations) & (carry[1] > tolerance))
 
     def average(_: int, spectrum: jax.Array) -> jax.Array:
-        view = jnp.fft.ifft2(spectrum[:, None] * masks)
-        moved = jnp.fft.fft2(_project(view, amplitudes, weights)) * back
-        return (moved + spectrum[:, None] * unseen).mean(1)
+        def add(i: Any, total: jax.Array) -> jax.Array:
+            view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], weights[:, i])
+            return total + jnp.fft.fft2(view) * back[i]
+
+        return jax.lax.fori_loop(0, images, add, spectrum * unseen.sum(0)) / images
 
     start = (
         first.astype(masks.dtype),

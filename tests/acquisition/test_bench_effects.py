@@ -52,7 +52,7 @@ def test_tilted_arms_measure_a_matrix_between_their_phases():
     jones = np.asarray(RetarderFirst().jones(SCENE.phantom.parameters))
     still = bench(**common)
     measured = tilted(jones, phase) * np.asarray(SCENE.phantom.gain)[..., None, None]
-    still._sample = (*still._sample[:3], measured.reshape(-1, 2, 2), still._sample[4])
+    still._sample = (*still._sample[:2], measured.reshape(-1, 2, 2), still._sample[3])
     expected = views_of(still)
     np.testing.assert_allclose(found[:3], expected[:3], atol=1.0 + 1e-5 * expected.max())
     assert np.abs(found[3:] - expected[3:]).max() > 50  # H against V shows it
