@@ -16,10 +16,12 @@ from threadpoolctl import threadpool_limits
 # Compiling dominates the time of a run: the compiler optimises little (a quarter of the time of a run) unless told
 # otherwise, but for tests that compute longer than they compile; the processes of a run share what they compile.
 OPTIMISED = os.environ.get("POLINFER_TEST_OPTIMISED", "0") != "0"
-# XLA's older emitter of fused loops compiles in a third of the time. An unknown flag would end the process: named for
-# the versions of JAX that are known to have it, and set before the first use of JAX, when XLA reads its flags.
+# XLA's older emitter of fused loops compiles in a third of the time; and the processes of a run have a core each. An
+# unknown flag would end the process: named for the versions of JAX that are known to have them, and set before the
+# first use of JAX, when XLA reads its flags.
 if not OPTIMISED and version("jaxlib").startswith("0.10."):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+    FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_multi_thread_eigen=false"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}".strip()
 # Traced code is made of a million small objects, and the garbage collector, which looks through all of them again and
 # again, took a twelfth of the time.
 gc.set_threshold(100_000, 20, 20)
@@ -54,9 +56,20 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_sessionfinish():
+    # pytest collects five times more, to find errors in what is freed: of millions of objects once is enough
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_runtest_setup(item):
     plain = not OPTIMISED and not {item.path.name, item.path.parent.name} & set(COMPUTES)
     jax.config.update("jax_disable_most_optimizations", plain)
+
+
+def pytest_runtest_teardown():
+    # examples in docstrings and documentation are outside of this folder, and come after whatever test
+    jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
 
 
 @pytest.fixture(scope="session")
