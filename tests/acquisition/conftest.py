@@ -5,6 +5,7 @@ import pytest
 
 import polinfer
 from acquisition import streaming
+from tests.conftest import OPTIMISED
 
 collect_ignore_glob = ["peer_*.py"]
 
@@ -16,7 +17,7 @@ def fits_that_compile_quickly():
 
     def quickly(*arguments, **keywords):
         before = jax.config.values["jax_disable_most_optimizations"]
-        jax.config.update("jax_disable_most_optimizations", True)
+        jax.config.update("jax_disable_most_optimizations", not OPTIMISED)
         try:
             return fit(*arguments, **keywords)
         finally:
