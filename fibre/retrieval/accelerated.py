@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from fibre.retrieval.base import RetrievalMethod, Solution, Stack
-from fibre.retrieval.gerchberg_saxton import GerchbergSaxton
+from fibre.retrieval.gerchberg_saxton import GerchbergSaxton, averaged
 from polinfer.checks import integer, real_number
 
 __all__ = ["Accelerated"]
@@ -90,7 +90,6 @@ def _run(
     tolerance: jax.Array, noise: jax.Array, iterations: Any, with_gains: bool,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
     """Fields (b, y, x), their last relative change (b,), iterations."""
-    unseen = (1 - jnp.abs(masks) ** 2).sum(0)
     # weight 1 is the variance of the best pixel: (relative noise)^2 mean(a^2); prior and misfit must share a unit
     unit = noise**2 * (weights * amplitudes**2).sum((1, 2, 3)) / jnp.maximum((weights > 0).sum((1, 2, 3)), 1)
 
@@ -102,24 +101,11 @@ def _run(
         root = jnp.maximum(root, 1e-3)
         return (root / jnp.exp(jnp.log(root).mean(1, keepdims=True))) ** 2
 
-    def project(spectrum: jax.Array, gains: jax.Array) -> jax.Array:
-        wanted = 1 / jnp.sqrt(gains)
-
-        def visit(i: Any, total: jax.Array) -> jax.Array:
-            view = jnp.fft.ifft2(spectrum * masks[i])
-            target = amplitudes[:, i] * wanted[:, i, None, None]
-            view = view * (1 + weights[:, i] * (target / jnp.maximum(jnp.abs(view), 1e-20) - 1))
-            return total + jnp.fft.fft2(view) * jnp.conj(masks[i])
-
-        # one view after the other: all of them at the same time leave the processor's cache
-        images = len(masks)
-        return jax.lax.fori_loop(0, images, visit, spectrum * unseen) / images
-
     def step(carry: _Carry) -> _Carry:
         last, ahead, t, gains, _, count = carry
         if with_gains:
             gains = jax.lax.cond(count % EVERY == 0, brightness, lambda _: gains, last)
-        new = project(ahead, gains)
+        new = averaged(ahead, amplitudes, weights, masks, 1 / jnp.sqrt(gains))
         uphill = (jnp.conj(ahead - new) * (new - last)).real.sum((1, 2)) > 0
         t = jnp.where(uphill, 1.0, t)
         following = 0.5 * (1 + jnp.sqrt(1 + 4 * t**2))

@@ -15,7 +15,7 @@ from fibre.retrieval.base import RetrievalMethod, Solution, Stack, misfit
 from polinfer.checks import integer, real_number
 from polinfer.threads import each, piece
 
-__all__ = ["GerchbergSaxton"]
+__all__ = ["GerchbergSaxton", "averaged"]
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,23 @@ def _project(view: jax.Array, amplitude: jax.Array, weight: jax.Array) -> jax.Ar
     return view * (1 + weight * (amplitude / jnp.maximum(modulus, 1e-20) - 1))
 
 
+def averaged(
+    spectrum: jax.Array, amplitudes: jax.Array, weights: jax.Array, masks: jax.Array, scale: jax.Array | None = None
+) -> jax.Array:
+    """The mean over the views of spectra (b, y, x) that have the amplitudes (b, m, y, x) there, as far as their weights
+    say; ``scale`` (b, m): of the amplitudes, None: 1. What a mask does not pass is left as it is."""
+    images = len(masks)
+
+    def add(i: Any, total: jax.Array) -> jax.Array:
+        wanted = amplitudes[:, i] if scale is None else amplitudes[:, i] * scale[:, i, None, None]
+        view = _project(jnp.fft.ifft2(spectrum * masks[i]), wanted, weights[:, i])
+        return total + jnp.fft.fft2(view) * jnp.conj(masks[i])
+
+    # one view after the other: all of them at the same time leave the processor's cache
+    unseen = (1 - jnp.abs(masks) ** 2).sum(0)
+    return jax.lax.fori_loop(0, images, add, spectrum * unseen) / images
+
+
 @partial(jax.jit, static_argnums=6)
 def _solve(
     amplitudes: jax.Array,
@@ -167,7 +184,7 @@ def _solve(
     unseen = 1 - jnp.abs(masks) ** 2
     usable = (weights > 0).astype(weights.dtype)
 
-    # one view after the other, in a loop that is compiled once: quicker than all at once, or than a row of them
+    # a loop that is compiled once: quicker than a row of all views
     def visit(i: Any, spectrum: jax.Array) -> jax.Array:
         view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], usable[:, i])
         return jnp.fft.fft2(view) * back[i] + spectrum * unseen[i]
@@ -187,11 +204,7 @@ def _solve(
         return jnp.any((carry[2] < iterations) & (carry[1] > tolerance))
 
     def average(_: int, spectrum: jax.Array) -> jax.Array:
-        def add(i: Any, total: jax.Array) -> jax.Array:
-            view = _project(jnp.fft.ifft2(spectrum * masks[i]), amplitudes[:, i], weights[:, i])
-            return total + jnp.fft.fft2(view) * back[i]
-
-        return jax.lax.fori_loop(0, images, add, spectrum * unseen.sum(0)) / images
+        return averaged(spectrum, amplitudes, weights, masks)
 
     start = (
         first.astype(masks.dtype),
