@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields, is_dataclass, replace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -144,6 +145,32 @@ def test_a_tampered_structure_is_an_error_and_runs_nothing(tmp_path):
         dataset.to_netcdf(tmp_path / "bad.nc", engine="h5netcdf")
         with pytest.raises(ValueError, match=r"bad\.nc"):
             polinfer.load(tmp_path / "bad.nc")
+
+
+@pytest.mark.parametrize("kind", ["link", "soft link", "raw", "virtual", "group"])
+def test_only_arrays_that_lie_in_the_file_are_read(kind, tmp_path):
+    """A file cannot make its reader look into other files: a variable put elsewhere is refused, though HDF5 follows."""
+    record = measurement()
+    path, other = polinfer.save(record, tmp_path / "a.nc"), polinfer.save(record, tmp_path / "other.nc")
+    with h5py.File(path, "r+") as file:
+        name = "response.real"
+        values = file[name][()]
+        del file[name]
+        if kind == "link":
+            file[name] = h5py.ExternalLink(other.name, name)
+        elif kind == "soft link":
+            file[name] = h5py.SoftLink("/response.imag")
+        elif kind == "raw":
+            values.tofile(tmp_path / "raw")
+            file.create_dataset(name, values.shape, values.dtype, external=[("raw", 0, values.nbytes)])
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(values.shape, values.dtype)
+            layout[:] = h5py.VirtualSource(other.name, name, values.shape)
+            file.create_virtual_dataset(name, layout)
+        else:
+            file.create_group(name)
+    with pytest.raises(ValueError, match=r"a\.nc.*response.real is no array of this file"):
+        polinfer.load(path)
 
 
 @pytest.mark.parametrize("position", range(0, 100, 7))
