@@ -15,6 +15,7 @@ import numpy as np
 from fibre.records import Interference
 from polinfer.checks import real_array
 from polinfer.precision import double_precision
+from polinfer.threads import each
 
 __all__ = ["relative_phase"]
 
@@ -57,11 +58,17 @@ def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference
         known = real_array("weights", weights, low=0, finite=True)
         if known.shape != images.shape:
             raise ValueError(f"weights must have the shape of images {images.shape}, got {known.shape}.")
+    shape = (*images.shape[:-3], *images.shape[-2:])
+    product, variance, mean = np.empty(shape, complex), np.empty(shape), np.empty(shape)
+    fields = list(np.ndindex(shape[:-2]))
+
+    # one field after the other: one code does for any number of them
+    def solve(k: int) -> None:
+        own = fields[k]
+        product.real[own], product.imag[own], variance[own], mean[own] = _solved(images[own], known[own], design)
+
     with double_precision(True):
-        parts = _solved(jnp.asarray(images), jnp.asarray(known), jnp.asarray(design))
-    real, imaginary, variance, mean = (np.asarray(part) for part in parts)
-    product = np.empty(mean.shape, complex)
-    product.real, product.imag = real, imaginary
+        each(solve, range(len(fields)))
     if weights is None:
         left = images - mean[..., None, :, :]
         left = left - np.einsum("j,...yx->...jyx", np.exp(1j * steps), product).real
@@ -72,12 +79,12 @@ def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference
 
 @jax.jit
 def _solved(images: Any, weight: Any, design: Any) -> tuple[Any, Any, Any, Any]:
-    """Real and imaginary part of conj(H) V, its variance for these weights and the mean, of (..., k, y, x).
+    """Real and imaginary part of conj(H) V, its variance for these weights and the mean, of (k, y, x).
 
     The normal matrices are inverted by cofactors. NaN where there is no inverse.
     """
-    known = [weight[..., j, :, :].astype(float) for j in range(len(design))]
-    seen = [w * images[..., j, :, :] for j, w in enumerate(known)]
+    known = [weight[j].astype(float) for j in range(len(design))]
+    seen = [w * images[j] for j, w in enumerate(known)]
     pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
     a, b, c, d, e, f = (sum(row[p] * row[q] * w for row, w in zip(design, known, strict=True)) for p, q in pairs)
     first, second, third = (sum(row[p] * s for row, s in zip(design, seen, strict=True)) for p in range(3))

@@ -7,6 +7,7 @@ In: a :class:`fibre.Diversity` (images of one field, or a batch, through known m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from tqdm import tqdm
 
 from fibre.records import Diversity, Fibrelets, Images, RetrievalStatus, Retrieved
 from polinfer.checks import one_of_types
+from polinfer.threads import each, piece
 
 __all__ = [
     "Amplitudes",
@@ -84,17 +86,17 @@ class Stack:
     @property
     def amplitudes(self) -> np.ndarray:
         """Square roots of the images, 0 for negative ones, float32 (b, m, y, x)."""
-        return np.asarray(self.measured.amplitudes)
+        return self.measured.amplitudes
 
     @property
     def weights(self) -> np.ndarray:
         """Inverse variances of the amplitudes over the best pixel's, float32 (b, m, y, x): 0 to 1, 0 = unusable."""
-        return np.asarray(self.measured.weights)
+        return self.measured.weights
 
     @property
     def noise(self) -> np.ndarray:
         """Noise of the amplitudes over the amplitudes (weighted), (b,); 0 where it is not known."""
-        return np.asarray(self.measured.noise)
+        return self.measured.noise
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def retrieve(diversity: Diversity, method: RetrievalMethod, batch: int = 8, prog
         if found.misfitted is None or uncertain is None:
             floor, misfitted = judged(found.field, stack.measured, masks)
         else:
-            floor, misfitted = np.asarray(_floor(measured, uncertain)), found.misfitted
+            floor, misfitted = _floors(measured, uncertain), found.misfitted
         spread[part] = floor[:, None, None] if found.variance is None else found.variance
         status[part] = np.where(found.converged, 0, RetrievalStatus.NOT_CONVERGED)
         status[part] |= np.where(misfitted, RetrievalStatus.MISFIT, 0).astype(np.uint8)
@@ -179,10 +181,23 @@ class Measured(NamedTuple):
     """amplitudes, weights (b, m, y, x); expected: the misfit that noise alone leaves, (b,), None where the noise is
     unknown; noise: of the amplitudes over the amplitudes, (b,)."""
 
-    amplitudes: jax.Array
-    weights: jax.Array
-    expected: jax.Array | None
-    noise: jax.Array
+    amplitudes: np.ndarray
+    weights: np.ndarray
+    expected: np.ndarray | None
+    noise: np.ndarray
+
+
+def _joined(work: Callable[[slice], Sequence[jax.Array]], count: int) -> list[np.ndarray]:
+    """What ``work`` finds of some of ``count`` fields: on a processor one by one on all cores, so that one code does
+    for batches of all sizes; on an accelerator all at once."""
+    size = piece(1, count)
+    found: list[Sequence[np.ndarray]] = [()] * -(-count // size)
+
+    def part(k: int) -> None:
+        found[k] = [np.asarray(values) for values in work(slice(k * size, (k + 1) * size))]
+
+    each(part, range(len(found)))
+    return [np.concatenate(values) for values in zip(*found, strict=True)]
 
 
 def _spread(intensities: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -193,20 +208,30 @@ def _spread(intensities: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax
     return variance / (4 * jnp.maximum(intensities, jnp.sqrt(variance))), usable
 
 
-@jax.jit
-def measured_amplitudes(intensities: jax.Array | np.ndarray, variance: jax.Array | np.ndarray | None) -> Measured:
+def measured_amplitudes(intensities: np.ndarray, variance: np.ndarray | None) -> Measured:
     """Amplitudes and weights of images (b, m, y, x)."""
-    amplitudes = jnp.sqrt(jnp.maximum(intensities, 0))
     if variance is None:
-        return Measured(amplitudes, jnp.ones_like(amplitudes), None, jnp.zeros(len(amplitudes), jnp.float32))
-    spread, usable = _spread(jnp.asarray(intensities), jnp.asarray(variance))
+        amplitudes = np.sqrt(np.maximum(intensities, 0))
+        return Measured(amplitudes, np.ones_like(amplitudes), None, np.zeros(len(amplitudes), np.float32))
+    return Measured(*_joined(lambda some: _measured(intensities[some], variance[some]), len(intensities)))
+
+
+@jax.jit
+def _measured(intensities: jax.Array, variance: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """What :class:`Measured` holds."""
+    amplitudes = jnp.sqrt(jnp.maximum(intensities, 0))
+    spread, usable = _spread(intensities, variance)
     best = jnp.where(usable, spread, jnp.inf).min((1, 2, 3))
     weights = jnp.where(usable, best[:, None, None, None] / spread, 0)
     power = (weights * amplitudes**2).sum((1, 2, 3))
     noise = jnp.sqrt(best * usable.sum((1, 2, 3)) / jnp.maximum(power, 1e-30))
     # sum of w = sum of best / spread: pixels of equal weight would each have this variance
     expected = best * usable.sum((1, 2, 3)) / weights.sum((1, 2, 3))
-    return Measured(amplitudes, weights, expected, noise)
+    return amplitudes, weights, expected, noise
+
+
+def _floors(intensities: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    return _joined(lambda some: [_floor(intensities[some], variance[some])], len(intensities))[0]
 
 
 @jax.jit
@@ -229,17 +254,21 @@ def misfit(field: np.ndarray, amplitudes: np.ndarray, weights: np.ndarray, masks
 
 def judged(field: np.ndarray, measured: Measured, masks: Any) -> tuple[np.ndarray, np.ndarray]:
     """Variance (b,) of the complex field from the image noise, and whether the images are misfitted beyond it, (b,)."""
-    floor, misfitted = _judged(field, measured, masks)
-    return np.asarray(floor), np.asarray(misfitted)
+    amplitudes, weights, expected, _ = measured
+    images = amplitudes.shape[1]
+
+    def judge(some: slice) -> Sequence[jax.Array]:
+        return _left(field[some], amplitudes[some], weights[some], masks)
+
+    left, power = _joined(judge, len(field))
+    if expected is None:
+        # nothing known of the noise: what the best fit leaves over is all there is to go by
+        return 2 * left / images, np.zeros(len(field), bool)
+    return 2 * expected / images, left > 2 * expected + 0.01 * power
 
 
 @jax.jit
-def _judged(field: jax.Array, measured: Measured, masks: jax.Array) -> tuple[jax.Array, jax.Array]:
-    amplitudes, weights, expected, _ = measured
-    images = amplitudes.shape[1]
-    left = _misfit(field, amplitudes, weights, masks)
-    if expected is None:
-        # nothing known of the noise: what the best fit leaves over is all there is to go by
-        return 2 * left / images, jnp.zeros(len(field), bool)
-    slack = 0.01 * (weights * amplitudes**2).sum((1, 2, 3)) / weights.sum((1, 2, 3))
-    return 2 * expected / images, left > 2 * expected + slack
+def _left(field: jax.Array, amplitudes: jax.Array, weights: jax.Array, masks: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The misfit and the measured power, weighted means over the pixels."""
+    power = (weights * amplitudes**2).sum((1, 2, 3)) / weights.sum((1, 2, 3))
+    return _misfit(field, amplitudes, weights, masks), power

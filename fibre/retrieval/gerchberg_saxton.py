@@ -69,7 +69,7 @@ class GerchbergSaxton(RetrievalMethod):
         everything, flat = np.arange(len(noise)), np.zeros(shape, np.float32)
         field, change, spent, left = self._run(stack, everything, tolerance, flat, coarse)
         # planes that contradict each other keep a field moving for ever: it is found where noise explains what is left
-        explained = np.zeros(len(noise)) if stack.measured.expected is None else 2 * np.asarray(stack.measured.expected)
+        explained = np.zeros(len(noise)) if stack.measured.expected is None else 2 * stack.measured.expected
         for restart in range(self.restarts):
             # a stagnated field leaves several times the misfit of its neighbours; noise differs far less
             chosen = np.flatnonzero(((change > tolerance) & (left > explained)) | (left > 1.5 * np.median(left)))
