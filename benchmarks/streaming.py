@@ -76,6 +76,8 @@ def run(results: Results, count: int, period: float, work: float, budget: float)
                 dropped=dropped, late=sum(f.late for f in found[10:]), median_ms=1e3 * float(np.median(latencies)),
                 percentile_99_ms=1e3 * float(np.quantile(latencies, 0.99)), seconds=spent, binds=binds,
                 off_by_std=max(apart))  # fmt: skip
+    if work < period:
+        results.bar("median latency over the budget", float(np.median(latencies)) / budget, 1.0)
     results.bar("frames fitted or counted as dropped", len(found) + dropped, count, at_least=True)
     results.bar("maps off the offline fit's, standard deviations", max(apart), 0.1)
 
@@ -122,6 +124,7 @@ def behind_a_fibre(results: Results, count: int, period: float) -> None:
                 fit_ms=1e3 * float(np.median([f.seconds["fit"] for f in found])), binds=found[-1].binds,
                 chi_square_inside=value[inside].sum() / freedom[inside].sum(),
                 chi_square_edge=value[~inside].sum() / freedom[~inside].sum(), off_by_std=apart)  # fmt: skip
+    results.bar("fibre: median latency over the budget", float(np.median(latencies)) / period, 1.0)
     results.bar("fibre: frames fitted or counted as dropped", len(found) + dropped, count, at_least=True)
     results.bar("fibre: maps off the offline fit's, standard deviations", apart, 0.1)
 

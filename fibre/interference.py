@@ -62,7 +62,7 @@ def relative_phase(images: Any, steps: Any, weights: Any = None) -> Interference
     product, variance, mean = np.empty(shape, complex), np.empty(shape), np.empty(shape)
     fields = list(np.ndindex(shape[:-2]))
 
-    # one field after the other: one code does for any number of them
+    # every field by itself: one code does for any number of them
     def solve(k: int) -> None:
         own = fields[k]
         product.real[own], product.imag[own], variance[own], mean[own] = _solved(images[own], known[own], design)
