@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import complex_array, one_of_types
+from .checks import broadcast, complex_array, one_of_types, real_array
+from .degeneracy import nearest, orbit
 from .orderings import Ordering
-from .records import Fit, Parameters
+from .records import PERIODS, Fit, Parameters
 
-__all__ = ["jones_chi_square"]
+__all__ = ["jones_chi_square", "standardised_errors"]
 
 
 def jones_chi_square(fit: Fit, jones: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -88,6 +89,55 @@ def jones_chi_square(fit: Fit, jones: Any) -> tuple[np.ndarray, np.ndarray]:
     chi_square = np.where(claimed, along / np.where(claimed, values, 1), 0).sum(-1)
     freedom = np.where(known, claimed.sum(-1), 0)
     return np.where(known, chi_square, np.nan).reshape(shape), freedom.reshape(shape)
+
+
+def standardised_errors(fit: Fit, truth: Parameters) -> Parameters:
+    r"""How far every fitted parameter is from the truth, in units of its own standard deviation.
+
+    .. math:: z_k = (p_k - q_k) / \mathrm{std}_k
+
+    with differences of angles wrapped, and q that one of the truth's eight equivalent sets that is nearest to the fit.
+    For an ordinary pixel z is standard normal. It is not where a parameter is hardly determined (an angle cannot be
+    further off than half its period): choose by the bound of the truth, :func:`polinfer.cramer_rao_bound`, and not by
+    the error found.
+
+    Parameters
+    ----------
+    fit: pixel shape P. truth: broadcasts to P, radians.
+
+    Returns
+    -------
+    Parameters of shape P; NaN where the fit states no standard deviation, and for fixed parameters.
+
+    Raises
+    ------
+    ValueError, TypeError: shapes and types.
+
+    >>> import polinfer
+    >>> truth = Parameters(0.3, 0.5, 1.2, 0.4, np.full(400, 0.2))
+    >>> model = polinfer.Model()
+    >>> states = np.array([[1, 1, 1], [1, 1j, -1]]) / 2**0.5
+    >>> result = polinfer.fit(model, polinfer.simulate(model, truth, states, sigma=0.01, rng=1))
+    >>> z = standardised_errors(result, truth)
+    >>> bool(abs(np.mean(z.retardance**2) - 1) < 5 * (2 / 400) ** 0.5)
+    True
+    """
+    one_of_types("fit", fit, (Fit,), "pass the result of fit().")
+    one_of_types("truth", truth, (Parameters,), "pass the five true parameters as Parameters(...).")
+    shape = fit.status.shape
+    true = Parameters(*(real_array(f"truth.{n}", x).astype(float) for n, x in zip(truth._fields, truth, strict=True)))
+    if broadcast(fit=shape, **{f"truth.{n}": x.shape for n, x in zip(truth._fields, true, strict=True)}) != shape:
+        raise ValueError(f"truth has more pixels than the fit, whose shape is {shape}; they must agree.")
+    found = Parameters(*(np.asarray(x, float) for x in fit.parameters))
+    near = nearest(orbit(Parameters(*(np.broadcast_to(x, shape) for x in true))), found)
+    errors = []
+    for value, own, period, std in zip(found, near, PERIODS, fit.std, strict=True):
+        apart = value - own
+        if np.isfinite(period):
+            apart = apart - period * np.round(apart / period)
+        known = np.isfinite(std) & (np.asarray(std) > 0)
+        errors.append(np.where(known, apart / np.where(known, std, 1), np.nan))
+    return Parameters(*errors)
 
 
 @partial(jax.jit, static_argnums=0)
